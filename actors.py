@@ -1,0 +1,133 @@
+"""Actors, critics and exploration: §2.2, §4.1 and the minor modifications 1, 2 and 4 of §4.2.
+
+The stochastic actor maximises the λ-return plus β times the entropy of the states it will visit; the deterministic
+actor, trained beside it, maximises the λ-return alone (Eq. 7). Each has its own critic, fitted on its own imagined
+sequences, since V and Q are of the *current policy*. The entropy comes from mdn.py as a number; what is imagined comes
+from world_model.py as tensors, time first: H steps, N sequences, D state, A action.
+"""
+
+import math
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.distributions import Normal
+
+from returns import lambda_return, survival
+
+
+def mlp(inputs: int, units: int, layers: int, outputs: int) -> nn.Sequential:
+    """`layers` hidden ELU layers of `units`, then a linear one, as in Dreamer."""
+    sizes = [inputs] + [units] * layers
+    hidden = [
+        m for i, o in zip(sizes, sizes[1:], strict=False) for m in (nn.Linear(i, o), nn.ELU())
+    ]
+    return nn.Sequential(*hidden, nn.Linear(sizes[-1], outputs))
+
+
+class StochasticActor(nn.Module):
+    """π(a | s) = tanh(Normal(μ, σ)), μ = 5 tanh(x / 5), σ = softplus(x + log(e⁵ − 1)) + 1e-4, as in Dreamer.
+
+    σ is near 5 at first, before the tanh: the untrained policy plays all actions, mostly the extreme ones.
+    """
+
+    def __init__(self, size: int, actions: int, units: int, layers: int = 4):
+        super().__init__()
+        self.net = mlp(size, units, layers, 2 * actions)
+
+    def distribution(self, state: Tensor) -> Normal:
+        """The distribution before the tanh, in float32: (…, D) -> Normal of (…, A)."""
+        mean, std = self.net(state).float().chunk(2, -1)
+        return Normal(5 * torch.tanh(mean / 5), F.softplus(std + math.log(math.exp(5) - 1)) + 1e-4)
+
+    def forward(self, state: Tensor) -> Tensor:
+        """A reparametrised sample of π(· | s), in [−1, 1]: (…, D) -> (…, A)."""
+        return torch.tanh(self.distribution(state).rsample())
+
+    def mode(self, state: Tensor) -> Tensor:
+        """The action that evaluation takes, tanh(μ): (…, D) -> (…, A)."""
+        return torch.tanh(self.distribution(state).mean)
+
+
+class DeterministicActor(nn.Module):
+    """A(s) = tanh(5 tanh(x / 5)), §4.1: trained beside the stochastic actor, evaluated in its place."""
+
+    def __init__(self, size: int, actions: int, units: int, layers: int = 4):
+        super().__init__()
+        self.net = mlp(size, units, layers, actions)
+
+    def forward(self, state: Tensor) -> Tensor:
+        """The action, in [−1, 1]: (…, D) -> (…, A)."""
+        return torch.tanh(5 * torch.tanh(self.net(state).float() / 5))
+
+    mode = forward
+
+
+class QCritic(nn.Module):
+    """Q(s, a) of the current policy, Eq. (2); minor modification 1 of §4.2."""
+
+    def __init__(self, size: int, actions: int, units: int, layers: int = 3):
+        super().__init__()
+        self.net = mlp(size + actions, units, layers, 1)
+
+    def forward(self, state: Tensor, action: Tensor) -> Tensor:
+        """(…, D), (…, A) -> (…). With a ~ π(s) this is a one-sample estimate of V(s) = E_a Q(s, a)."""
+        return self.net(torch.cat([state, action], -1)).float().squeeze(-1)
+
+
+class VCritic(nn.Module):
+    """V(s) of the current policy, Eq. (1): the critic of the original Dreamer."""
+
+    def __init__(self, size: int, units: int, layers: int = 3):
+        super().__init__()
+        self.net = mlp(size, units, layers, 1)
+
+    def forward(self, state: Tensor, action: Tensor) -> Tensor:
+        """(…, D), (…, A) -> (…). The action is taken so that either critic can stand in the loop; V ignores it."""
+        return self.net(state).float().squeeze(-1)
+
+
+def imagined_returns(dream, critic: nn.Module, gamma: float, lam: float) -> Tensor:
+    """R_0 … R_{H−1} of a dream, (H, N), with V(s_k) = Q(s_k, a_k) at the dream's own actions a_k ~ π(s_k)."""
+    value = critic(dream.state[1:], dream.action[1:])
+    return lambda_return(dream.reward, dream.continues, value, gamma, lam)
+
+
+def actor_loss(returns: Tensor, continues: Tensor, first_state_only: bool) -> Tensor:
+    """−R, what an actor minimises but for the entropy: a scalar.
+
+    First state only (§4.2): −R_0, averaged over the N starting states. The later actions still receive gradient,
+    through the imagined sequence that R_0 sums over. Otherwise, as in Dreamer, the mean of S_k R_k over all imagined
+    states, S their survival.
+    """
+    if first_state_only:
+        return -returns[0].mean()
+    return -(survival(continues) * returns).mean()
+
+
+def critic_loss(critic: nn.Module, dream, returns: Tensor, smooth_l1: bool) -> Tensor:
+    """Regression of the critic on R_0 … R_{H−1}, weighted by survival (§4.2): a scalar, gradient in the critic alone.
+
+    Smooth L1 with its knee at 1 (minor modification 2), or ½(Q − R)². Smooth L1 does not estimate a mean: of
+    returns that are 0 nine times in ten and 10 once it makes 1/9, where the mean is 1.
+    """
+    value = critic(dream.state[:-1].detach(), dream.action[:-1].detach())
+    target = returns.detach()
+    error = (
+        F.smooth_l1_loss(value, target, reduction="none")
+        if smooth_l1
+        else 0.5 * (value - target).square()
+    )
+    return (survival(dream.continues) * error).mean()
+
+
+def explore(
+    action: np.ndarray, noise: float, random_probability: float, rng: np.random.Generator
+) -> np.ndarray:
+    """The action that collection takes: additive Gaussian noise, clipped to [−1, 1], or with a probability a
+    uniformly random one (minor modification 4 of §4.2)."""
+    if rng.random() < random_probability:
+        return rng.uniform(-1, 1, action.shape).astype(np.float32)
+    noisy = action + noise * rng.standard_normal(action.shape)
+    return noisy.clip(-1, 1).astype(np.float32)

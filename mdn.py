@@ -1,0 +1,158 @@
+"""The discounted distribution of future states and its entropy: §3 and §4.1, Eqs. (6), (8), (9), (10).
+
+q(x | s_t) is the discounted occupancy of the states that the policy visits strictly after s_t. A mixture density
+network P(x | s_t) learns it from imagined states (`mdn_loss`), bootstrapping from itself at the last one, and the
+stochastic actor maximises the entropy of P (`entropy`), estimated the same way. This file sees tensors of states
+s = (h, z); it knows neither the world model nor the actors. γ here is γ_q, the discount of q, not that of returns.
+
+Departures from print, all shown in tests/test_mdn.py: with termination the printed weights do not sum to one; (8)
+and (9) are off by one step; (10) counts s_t itself, an atom of unbounded likelihood in a continuous space, and
+misses step n. And "importance sampling" is bootstrapping, with the ratio q / P taken to be one.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+
+class Mixture(NamedTuple):
+    """A mixture of K diagonal Gaussians over states for each of N conditioning states, in float32."""
+
+    log_weights: Tensor  # (N, K) log π, normalised
+    mean: Tensor  # (N, K, D)
+    std: Tensor  # (N, K, D)
+
+    def log_prob(self, x: Tensor) -> Tensor:
+        """log P(x | s), of shape (M, N), for M points x of shape (M, N, D) per conditioning state.
+
+        Σ_d (x_d − μ_d)² / σ_d² is expanded into two batched matrix products, x² · σ⁻² and x · μσ⁻²: the broadcast
+        (x − μ)² would hold M·N·K·D numbers. At the paper's sizes: 0.14 s instead of 2.0 s, forward and backward.
+        """
+        assert x.shape[1:] == (self.mean.shape[0], self.mean.shape[2]), (x.shape, self.mean.shape)
+        with torch.autocast(x.device.type, enabled=False):
+            x = x.float().transpose(0, 1)  # (N, M, D)
+            precision = self.std.pow(-2)
+            quadratic = torch.bmm(x.square(), precision.mT) - 2 * torch.bmm(
+                x, (self.mean * precision).mT
+            )  # (N, M, K)
+            constant = (
+                self.mean.square() * precision + 2 * self.std.log() + math.log(2 * math.pi)
+            ).sum(-1)
+            component = -0.5 * (quadratic + constant.unsqueeze(1))
+            return torch.logsumexp(self.log_weights.unsqueeze(1) + component, -1).T
+
+    def sample_components(self) -> Tensor:
+        """One reparametrised sample of each component: (K, N, D)."""
+        return (self.mean + self.std * torch.randn_like(self.std)).transpose(0, 1)
+
+
+class MixtureDensityNetwork(nn.Module):
+    """P(· | s): the mixture density network of §4.1, 8 components on two hidden layers of 256 (§5).
+
+    Args:
+        size: D, numbers in a state.
+        components: K.
+        units: width of the hidden layers.
+        min_std: floor under σ. h is a deterministic function of what came before it, so the true density is
+            singular and its likelihood unbounded: without a floor, −log P has no minimum.
+    """
+
+    def __init__(self, size: int, components: int = 8, units: int = 256, min_std: float = 0.1):
+        super().__init__()
+        self.size, self.components, self.min_std = size, components, min_std
+        self.hidden = nn.Sequential(
+            nn.Linear(size, units), nn.ELU(), nn.Linear(units, units), nn.ELU()
+        )
+        self.head = nn.Linear(units, components * (1 + 2 * size))
+
+    def forward(self, state: Tensor) -> Mixture:
+        """The mixture given each state: (N, D) -> Mixture."""
+        out = self.head(self.hidden(state)).float().unflatten(-1, (self.components, -1))
+        log_weights, mean, std = out.split([1, self.size, self.size], -1)
+        return Mixture(log_weights.flatten(1).log_softmax(-1), mean, F.softplus(std) + self.min_std)
+
+
+def discounted_weights(continues: Tensor, gamma: float) -> tuple[Tensor, Tensor]:
+    """Weights of the n imagined states and of the bootstrap in q(· | s_t): Eqs. (8)–(10) with termination.
+
+        m_0 = 1,  m_k = Π_{j≤k} γ c_{t+j};   w_k = m_{k−1} − m_k,  w_b = m_n;   Σ_k w_k + w_b = 1
+
+    Without termination w_k = (1 − γ) γ^{k−1} and w_b = γ^n; where the episode ends, the unspent mass stays.
+
+    Args:
+        continues: (n, N) c of s_{t+1} … s_{t+n}.
+        gamma: γ_q.
+
+    Returns:
+        w of shape (n, N) and w_b of shape (N,).
+    """
+    mass = torch.cat([torch.ones_like(continues[:1]), (gamma * continues).cumprod(0)])
+    return mass[:-1] - mass[1:], mass[-1]
+
+
+def cross_entropy(
+    density: Mixture, following: Tensor, continues: Tensor, tail: Mixture, gamma: float
+) -> Tensor:
+    """−E_{x ~ q(· | s_t)} log P(x | s_t): Eq. (10) with L = −log P, one value for each s_t.
+
+        −Σ_k w_k log P(s_{t+k} | s_t) − w_b E_{s̃ ~ P(· | s_{t+n})} log P(s̃ | s_t)
+
+    s̃ is not one draw: its K components are enumerated, each sampled once and weighted by its π, so the estimate is
+    unbiased in π's gradient too (drawing a component would lose it).
+
+    Args:
+        density: P(· | s_t).
+        following: (n, N, D) s_{t+1} … s_{t+n}.
+        continues: (n, N) c in those states.
+        tail: P(· | s_{t+n}), from which the bootstrap s̃ is drawn.
+        gamma: γ_q.
+
+    Returns:
+        (N,) in nats.
+    """
+    weights, tail_weight = discounted_weights(continues, gamma)
+    log_prob = density.log_prob(torch.cat([following, tail.sample_components()]))  # (n + K, N)
+    along, beyond = log_prob.split([len(following), log_prob.shape[0] - len(following)])
+    return -(weights * along).sum(0) - tail_weight * (tail.log_weights.exp().T * beyond).sum(0)
+
+
+def mdn_loss(mdn: MixtureDensityNetwork, states: Tensor, continues: Tensor, gamma: float) -> Tensor:
+    """Negative log-likelihood that the MDN minimises, Eq. (10): (N,) nats, gradient in the online MDN alone.
+
+    Args:
+        mdn: the online network.
+        states: (n + 1, N, D) s_t … s_{t+n}, of the policy whose future is to be learnt.
+        continues: (n, N) c in s_{t+1} … s_{t+n}.
+        gamma: γ_q.
+    """
+    states, continues = states.detach(), continues.detach()  # the data, whatever made them
+    with torch.no_grad():
+        tail = mdn(states[-1])
+    return cross_entropy(mdn(states[0]), states[1:], continues, tail, gamma)
+
+
+def entropy(
+    target: MixtureDensityNetwork, states: Tensor, continues: Tensor, gamma: float
+) -> Tensor:
+    """Ĥ of the discounted state distribution, the second term of the objective (7): (N,) nats.
+
+    Gradient flows to the policy through the imagined states, their c and s̃ ~ P_T(· | s_{t+n}). It could not flow
+    through samples of P_T(· | s_t): those do not depend on what the policy does after s_t.
+
+    Args:
+        target: P_T, the target network, whose parameters do not require gradient.
+        states, continues, gamma: as in `mdn_loss`, not detached.
+    """
+    with torch.no_grad():
+        density = target(states[0])  # s_t is given, not chosen
+    return cross_entropy(density, states[1:], continues, target(states[-1]), gamma)
+
+
+@torch.no_grad()
+def soft_update(target: nn.Module, online: nn.Module, rate: float) -> None:
+    """θ_T ← (1 − λ) θ_T + λ θ, §4.1 (λ there is this rate, 0.1 in §5; it is not the λ of Eq. 5)."""
+    for old, new in zip(target.parameters(), online.parameters(), strict=True):
+        old.lerp_(new, rate)

@@ -1,0 +1,57 @@
+"""Returns of an imagined sequence: the λ-return with termination (Eq. 5) and survival (§4.2).
+
+Pure functions of tensors, time first. Everything is arrival-indexed, as the whole code is: row k of `reward` and
+of `continues` belongs to the state s_{t+k+1} that the k-th imagined action led to.
+"""
+
+import torch
+from torch import Tensor
+
+
+def lambda_return(
+    reward: Tensor, continues: Tensor, value: Tensor, gamma: float, lam: float
+) -> Tensor:
+    """λ-return of every imagined state but the last, Eq. (5) with termination.
+
+        R_H = V(s_H);   R_k = r(s_{k+1}) + γ c_{k+1} [ (1 − λ) V(s_{k+1}) + λ R_{k+1} ]
+
+    Args:
+        reward: (H, N) r(s_1) … r(s_H), the reward for arriving in each state.
+        continues: (H, N) c = 1 − d, the probability that the episode goes on in s_1 … s_H.
+        value: (H, N) V(s_1) … V(s_H).
+        gamma: discount γ of one decision.
+        lam: λ; 0 gives the one-step target, 1 the discounted rewards with V(s_H) at their end.
+
+    Returns:
+        (H, N) R_0 … R_{H−1}.
+
+    Departure from print: the unnumbered definition above Eq. (5) has weights that sum to 1 + λ^T (1 − λ). Eq. (5)
+    is right, and this is Eq. (5) as a recursion, for every state at once, with c in the place of 1.
+    """
+    assert reward.shape == continues.shape == value.shape, (
+        reward.shape,
+        continues.shape,
+        value.shape,
+    )
+    one_step = reward + gamma * continues * (1 - lam) * value
+    carry = gamma * lam * continues
+    returns, following = [], value[-1]
+    for k in reversed(range(len(reward))):
+        following = one_step[k] + carry[k] * following
+        returns.append(following)
+    return torch.stack(returns[::-1])
+
+
+def survival(continues: Tensor) -> Tensor:
+    """Probability S that the imagined episode has not ended before each state (§4.2), without gradient.
+
+        S_0 = 1;   S_k = c_1 c_2 … c_k
+
+    Args:
+        continues: (H, N) c in s_1 … s_H.
+
+    Returns:
+        (H, N) S_0 … S_{H−1}, the weights of the states that actions were taken in.
+    """
+    continues = continues.detach()  # a policy must not earn by making its own states count less
+    return torch.cat([torch.ones_like(continues[:1]), continues[:-1].cumprod(0)])

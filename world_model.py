@@ -1,0 +1,310 @@
+"""The world model: §2.2 with the modifications of §4.2. Encoder, RSSM, decoder, reward and termination heads; Eqs. (3), (4).
+
+What it does: turns sequences of images into states s = (h, z) (`observe`), continues them without images under a
+policy (`imagine`), and says how wrong it is, as named terms (`WorldModel.loss`). It knows no actor, no setting and no
+optimiser.
+
+Time is arrival-indexed. Row t of an episode holds the observation o_t, the action a_{t−1} that led to it, and the
+reward and termination received on arriving there; the first row has action 0 and `is_first`.
+
+    h_t = GRU(dense(z_{t−1}, a_{t−1}), h_{t−1}), h_0 = 0;   z_t ~ p(z | h_t, o_t) learning and acting, p(z | h_t) imagining
+    r(s_t), d(s_t): reward and end of the episode "for achieving state s_t";   c = 1 − d
+
+Tensor legend of the whole code: B sequences, T steps of a sequence, N starting states, H horizon, K mixture
+components, D = deter + stoch, A action dimensions. Batch first in replay (B, T, …), time first in imagination (H, N, …).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.distributions import Normal, kl_divergence
+
+SLICE = 256  # images through the convolutions at once: their activations then stay in the processor's cache
+
+
+class Observed(NamedTuple):
+    """What `observe` makes of B sequences."""
+
+    state: Tensor  # (B, T, D) s = (h, z), z sampled from the posterior
+    posterior: Normal  # of (B, T, stoch): p(z_t | h_t, o_t)
+    prior: Normal  # of (B, T, stoch): p(z_t | h_t); h_t already holds z_{t−1} and a_{t−1}
+
+
+class Dream(NamedTuple):
+    """What `imagine` makes of N starting states s_0."""
+
+    state: Tensor  # (H + 1, N, D) s_0 … s_H
+    action: Tensor  # (H + 1, N, A) a_k = π(s_k); a_H is chosen and never taken, for V(s_H) = Q(s_H, a_H)
+    reward: Tensor  # (H, N) r(s_1) … r(s_H)
+    continues: Tensor  # (H, N) c = 1 − d in s_1 … s_H
+
+
+def in_slices(module: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
+    """module(x), computed for `SLICE` rows at a time."""
+    return torch.cat([module(part) for part in x.split(SLICE)])
+
+
+class Encoder(nn.Module):
+    """64×64 images to embeddings: four 4×4 convolutions of stride 2 with depth, 2, 4 and 8·depth channels, ReLU."""
+
+    def __init__(self, depth: int):
+        super().__init__()
+        channels = [3, depth, 2 * depth, 4 * depth, 8 * depth]
+        convolutions = [
+            nn.Conv2d(i, o, 4, stride=2) for i, o in zip(channels, channels[1:], strict=False)
+        ]
+        self.net = nn.Sequential(*[m for c in convolutions for m in (c, nn.ReLU())], nn.Flatten())
+        self.net.to(memory_format=torch.channels_last)
+        self.size = 8 * depth * 2 * 2
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(M, 64, 64, 3) uint8 -> (M, 32 · depth)."""
+        return in_slices(lambda part: self.net(centre(part).permute(0, 3, 1, 2)), image)
+
+
+class Decoder(nn.Module):
+    """States to images: a linear layer, then transposed convolutions of kernels 5, 5, 6, 6 and stride 2, ReLU.
+
+    The first transposed convolution acts on a 1×1 map, where it is a linear layer, and is written as one.
+    """
+
+    def __init__(self, inputs: int, depth: int):
+        super().__init__()
+        self.depth = depth
+        self.linear = nn.Sequential(
+            nn.Linear(inputs, 32 * depth), nn.Linear(32 * depth, 5 * 5 * 4 * depth), nn.ReLU()
+        )
+        self.net = nn.Sequential(
+            nn.ConvTranspose2d(4 * depth, 2 * depth, 5, stride=2),  # 5 -> 13
+            nn.ReLU(),
+            nn.ConvTranspose2d(2 * depth, depth, 6, stride=2),  # 13 -> 30
+            nn.ReLU(),
+            nn.ConvTranspose2d(depth, 3, 6, stride=2),  # 30 -> 64
+        ).to(memory_format=torch.channels_last)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(M, inputs) -> (M, 64, 64, 3) in the range of `centre`."""
+        maps = self.linear(x).unflatten(-1, (5, 5, 4 * self.depth)).permute(0, 3, 1, 2)
+        return in_slices(self.net, maps).permute(0, 2, 3, 1)
+
+
+def centre(image: Tensor) -> Tensor:
+    """uint8 pixels to [−0.5, 0.5]."""
+    return image.float() / 255 - 0.5
+
+
+def normal(statistics: Tensor) -> Normal:
+    """(…, 2 · stoch) to a diagonal Gaussian of (…, stoch) in float32, std = softplus + 0.1 as in Dreamer."""
+    mean, std = statistics.float().chunk(2, -1)
+    return Normal(mean, F.softplus(std) + 0.1, validate_args=False)
+
+
+def mlp(inputs: int, units: int, layers: int, outputs: int) -> nn.Sequential:
+    """`layers` hidden ELU layers of `units`, then a linear one, as in Dreamer."""
+    sizes = [inputs] + [units] * layers
+    hidden = [
+        m for i, o in zip(sizes, sizes[1:], strict=False) for m in (nn.Linear(i, o), nn.ELU())
+    ]
+    return nn.Sequential(*hidden, nn.Linear(sizes[-1], outputs))
+
+
+class WorldModel(nn.Module):
+    """The recurrent state-space model with its encoder, decoder and heads.
+
+    Args:
+        actions: A.
+        deter, stoch: sizes of h and z.
+        hidden: units of the RSSM's dense layers.
+        units: units of the reward and termination heads.
+        depth: channels of the first convolution.
+        termination: learn when episodes end (§4.2); without it c = 1 everywhere.
+        fixed_prior: KL to N(0, 1) and Jeffreys to the learnt prior (§4.2), in the place of KL to the learnt prior.
+        smooth_l1: Smooth L1 loss of the reward (§4.2, minor 2), in the place of ½(r − r')².
+        decode_stoch_only: the decoder sees z alone (§4.2, minor 3), in the place of (h, z).
+        observe_first: z_0 is inferred from o_0, so a_0 depends on it (§4.2). Without it s_0 = (0, 0) and o_0 is never seen.
+        free_nats: KL below which there is nothing to gain (Dreamer); with `fixed_prior` unused.
+    """
+
+    def __init__(
+        self,
+        actions: int,
+        *,
+        deter: int,
+        stoch: int,
+        hidden: int,
+        units: int,
+        depth: int,
+        termination: bool,
+        fixed_prior: bool,
+        smooth_l1: bool,
+        decode_stoch_only: bool,
+        observe_first: bool,
+        free_nats: float,
+    ):
+        super().__init__()
+        self.deter, self.stoch, self.size = deter, stoch, deter + stoch
+        self.fixed_prior, self.smooth_l1, self.free_nats = fixed_prior, smooth_l1, free_nats
+        self.decode_stoch_only, self.observe_first = decode_stoch_only, observe_first
+        self.encoder = Encoder(depth)
+        self.dense_stoch = nn.Linear(
+            stoch, hidden, bias=False
+        )  # with the next: one dense layer on (z, a), whose
+        self.dense_action = nn.Linear(actions, hidden)  # second half needs no recurrence
+        self.gru = nn.GRUCell(hidden, deter)
+        self.prior_net = mlp(deter, hidden, 1, 2 * stoch)
+        self.posterior_deter = nn.Linear(
+            deter, hidden, bias=False
+        )  # likewise one dense layer on (h, embedding)
+        self.posterior_embed = nn.Linear(self.encoder.size, hidden)
+        self.posterior_out = nn.Linear(hidden, 2 * stoch)
+        self.decoder = Decoder(stoch if decode_stoch_only else self.size, depth)
+        self.reward = mlp(self.size, units, 2, 1)
+        self.termination = mlp(self.size, units, 3, 1) if termination else None
+
+    def recur(self, deter: Tensor, stoch: Tensor, action_share: Tensor) -> Tensor:
+        """h_t = GRU(dense(z_{t−1}, a_{t−1}), h_{t−1}), the action's share of the dense layer given."""
+        return self.gru(F.elu(self.dense_stoch(stoch) + action_share), deter)
+
+    def observe(
+        self, image: Tensor, action: Tensor, is_first: Tensor, previous: Tensor | None = None
+    ) -> Observed:
+        """States of B sequences; the state is reset where an episode starts, so sequences may cross episodes.
+
+        Args:
+            image: (B, T, 64, 64, 3) uint8.
+            action: (B, T, A), the action that led to each row.
+            is_first: (B, T) bool.
+            previous: (B, D), the state before the first row; zeros if None.
+        """
+        length = image.shape[1]
+        embedding = self.encoder(image.flatten(0, 1)).unflatten(0, image.shape[:2])
+        embed_share = self.posterior_embed(
+            embedding
+        )  # (B, T, hidden), as is all that follows outside the loop
+        action_share = self.dense_action(action)
+        noise = torch.randn(*image.shape[:2], self.stoch, device=image.device)
+        going_on = (~is_first).float().unsqueeze(-1)
+        if previous is None:
+            previous = torch.zeros(len(image), self.size, device=image.device)
+        deter, stoch = previous.split([self.deter, self.stoch], -1)
+        deters, stochs, statistics = [], [], []
+        for t in range(length):
+            # h_0 = 0: nothing of the episode before passes, in h nor in z, which enters through h alone
+            deter = going_on[:, t] * self.recur(deter, stoch, action_share[:, t])
+            out = self.posterior_out(F.elu(self.posterior_deter(deter) + embed_share[:, t]))
+            posterior = normal(out)
+            stoch = posterior.mean + posterior.stddev * noise[:, t]
+            if not self.observe_first:
+                stoch = going_on[:, t] * stoch
+            deters.append(deter), stochs.append(stoch), statistics.append(out)
+        deter = torch.stack(deters, 1)  # (B, T, deter)
+        state = torch.cat([deter, torch.stack(stochs, 1)], -1)
+        return Observed(state, normal(torch.stack(statistics, 1)), normal(self.prior_net(deter)))
+
+    def imagine(
+        self,
+        start: Tensor,
+        policy: Callable[[Tensor], Tensor],
+        horizon: int,
+        first_action: Tensor | None = None,
+    ) -> Dream:
+        """H steps from N states through the prior, differentiable in the policy's actions.
+
+        Args:
+            start: (N, D).
+            policy: states (N, D) to actions (N, A).
+            horizon: H.
+            first_action: (N, A), in the place of policy(start) if given.
+        """
+        deter, stoch = start.split([self.deter, self.stoch], -1)
+        states, actions = [start], [policy(start) if first_action is None else first_action]
+        for _ in range(horizon):
+            deter = self.recur(deter, stoch, self.dense_action(actions[-1]))
+            stoch = normal(self.prior_net(deter)).rsample()
+            states.append(torch.cat([deter, stoch], -1))
+            actions.append(policy(states[-1]))
+        state = torch.stack(states)
+        return Dream(
+            state,
+            torch.stack(actions),
+            self.predict_reward(state[1:]),
+            self.predict_continues(state[1:]),
+        )
+
+    def predict_reward(self, state: Tensor) -> Tensor:
+        """r(s): (…, D) -> (…), the reward for achieving the state."""
+        return self.reward(state).float().squeeze(-1)
+
+    def predict_continues(self, state: Tensor) -> Tensor:
+        """c(s) = 1 − d(s): (…, D) -> (…), the probability that the episode goes on from the state."""
+        if self.termination is None:
+            return torch.ones(state.shape[:-1], device=state.device)
+        return torch.sigmoid(-self.termination(state).float()).squeeze(-1)
+
+    def decode(self, state: Tensor) -> Tensor:
+        """(…, D) -> (…, 64, 64, 3) in [−0.5, 0.5], from z alone if `decode_stoch_only` (§4.2, minor 3)."""
+        seen = state[..., self.deter :] if self.decode_stoch_only else state
+        return self.decoder(seen.flatten(0, -2)).unflatten(0, state.shape[:-1])
+
+    def loss(self, batch: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
+        """The loss as named, unweighted terms, means over batch and time: Eqs. (3) and (4), and §4.2.
+
+            image        ½ Σ (o − o')² over pixels: −log Normal(o', 1) but for a constant
+            reward       Smooth L1, or ½(r − r')²; not on first rows, which arrive with none
+            termination  binary cross-entropy on `terminated`, never on `truncated`; not on first rows
+            kl_standard  KL(posterior ‖ N(0, 1))                         §4.2; gives the prior no gradient
+            jeffreys     KL(posterior ‖ prior) + KL(prior ‖ posterior)     §4.2
+            kl           max(KL(posterior ‖ prior), free nats), in the place of the last two in the original Dreamer
+
+        Departures from print: the sign before KL in (4); the prior of step t + 1 in (3) lacks the action, which
+        h_{t+1} holds.
+
+        Args:
+            batch: image (B, T, 64, 64, 3) uint8; action (B, T, A), reward, terminated, is_first (B, T).
+
+        Returns:
+            the terms, and the posterior states (B, T, D).
+        """
+        observed = self.observe(batch["image"], batch["action"], batch["is_first"])
+        arrived = (~batch["is_first"]).float()
+        seen = torch.ones_like(arrived) if self.observe_first else arrived
+        error = self.decode(observed.state).float() - centre(batch["image"])
+        predicted = self.reward(observed.state).float().squeeze(-1)
+        reward_loss = (
+            F.smooth_l1_loss if self.smooth_l1 else lambda *a, **k: 0.5 * F.mse_loss(*a, **k)
+        )
+        terms = {
+            "image": 0.5 * masked_mean(error.square().flatten(2).sum(-1), seen),
+            "reward": masked_mean(
+                reward_loss(predicted, batch["reward"], reduction="none"), arrived
+            ),
+        }
+        if self.termination is not None:
+            logit = self.termination(observed.state).float().squeeze(-1)
+            bce = F.binary_cross_entropy_with_logits(
+                logit, batch["terminated"].float(), reduction="none"
+            )
+            terms["termination"] = masked_mean(bce, arrived)
+        terms |= self.divergences(observed.posterior, observed.prior, seen)
+        return terms, observed.state
+
+    def divergences(self, posterior: Normal, prior: Normal, seen: Tensor) -> dict[str, Tensor]:
+        """The terms of `loss` that hold the posterior to the prior, in nats, summed over z."""
+        to_prior = kl_divergence(posterior, prior).sum(-1)
+        if not self.fixed_prior:
+            return {"kl": masked_mean(to_prior, seen).clamp(min=self.free_nats)}
+        standard = Normal(torch.zeros_like(posterior.mean), torch.ones_like(posterior.stddev))
+        jeffreys = to_prior + kl_divergence(prior, posterior).sum(-1)
+        to_standard = kl_divergence(posterior, standard).sum(-1)
+        return {
+            "kl_standard": masked_mean(to_standard, seen),
+            "jeffreys": masked_mean(jeffreys, seen),
+        }
+
+
+def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
+    """Mean of x where mask is 1; 0 where it is nowhere."""
+    return (x * mask).sum() / mask.sum().clamp(min=1)
