@@ -21,7 +21,9 @@ def mlp(inputs: int, units: int, layers: int, outputs: int) -> nn.Sequential:
     """`layers` hidden ELU layers of `units`, then a linear one, as in Dreamer."""
     sizes = [inputs] + [units] * layers
     hidden = [
-        m for i, o in zip(sizes, sizes[1:], strict=False) for m in (nn.Linear(i, o), nn.ELU())
+        m
+        for i, o in zip(sizes, sizes[1:], strict=False)
+        for m in (nn.Linear(i, o), nn.ELU(inplace=True))
     ]
     return nn.Sequential(*hidden, nn.Linear(sizes[-1], outputs))
 

@@ -64,7 +64,10 @@ class MixtureDensityNetwork(nn.Module):
         super().__init__()
         self.size, self.components, self.min_std = size, components, min_std
         self.hidden = nn.Sequential(
-            nn.Linear(size, units), nn.ELU(), nn.Linear(units, units), nn.ELU()
+            nn.Linear(size, units),
+            nn.ELU(inplace=True),
+            nn.Linear(units, units),
+            nn.ELU(inplace=True),
         )
         self.head = nn.Linear(units, components * (1 + 2 * size))
 
@@ -146,8 +149,7 @@ def entropy(
         target: P_T, the target network, whose parameters do not require gradient.
         states, continues, gamma: as in `mdn_loss`, not detached.
     """
-    with torch.no_grad():
-        density = target(states[0])  # s_t is given, not chosen
+    density = target(states[0].detach())  # s_t is given, not chosen
     return cross_entropy(density, states[1:], continues, target(states[-1]), gamma)
 
 

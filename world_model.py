@@ -42,9 +42,10 @@ class Dream(NamedTuple):
     continues: Tensor  # (H, N) c = 1 − d in s_1 … s_H
 
 
-def in_slices(module: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
-    """module(x), computed for `SLICE` rows at a time."""
-    return torch.cat([module(part) for part in x.split(SLICE)])
+def in_slices(function: Callable[..., Tensor], *inputs: Tensor) -> Tensor:
+    """function(*inputs), computed for `SLICE` rows of the inputs at a time."""
+    parts = zip(*(x.split(SLICE) for x in inputs), strict=True)
+    return torch.cat([function(*part) for part in parts])
 
 
 class Encoder(nn.Module):
@@ -86,9 +87,17 @@ class Decoder(nn.Module):
         ).to(memory_format=torch.channels_last)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(M, inputs) -> (M, 64, 64, 3) in the range of `centre`."""
+        """(M, inputs) -> (M, 64, 64, 3), in the range of `centre`."""
         maps = self.linear(x).unflatten(-1, (5, 5, 4 * self.depth)).permute(0, 3, 1, 2)
-        return in_slices(self.net, maps).permute(0, 2, 3, 1)
+        return self.net(maps).permute(0, 2, 3, 1).float()
+
+    def nll(self, x: Tensor, image: Tensor) -> Tensor:
+        """½ Σ (o − o')² over pixels, −log Normal(o'; o, 1) but for a constant: (M, inputs), (M, 64, 64, 3) -> (M,)."""
+
+        def part(x: Tensor, image: Tensor) -> Tensor:
+            return 0.5 * (self(x) - centre(image)).square().flatten(1).sum(1)
+
+        return in_slices(part, x, image)
 
 
 def centre(image: Tensor) -> Tensor:
@@ -106,7 +115,9 @@ def mlp(inputs: int, units: int, layers: int, outputs: int) -> nn.Sequential:
     """`layers` hidden ELU layers of `units`, then a linear one, as in Dreamer."""
     sizes = [inputs] + [units] * layers
     hidden = [
-        m for i, o in zip(sizes, sizes[1:], strict=False) for m in (nn.Linear(i, o), nn.ELU())
+        m
+        for i, o in zip(sizes, sizes[1:], strict=False)
+        for m in (nn.Linear(i, o), nn.ELU(inplace=True))
     ]
     return nn.Sequential(*hidden, nn.Linear(sizes[-1], outputs))
 
@@ -244,10 +255,9 @@ class WorldModel(nn.Module):
             return torch.ones(state.shape[:-1], device=state.device)
         return torch.sigmoid(-self.termination(state).float()).squeeze(-1)
 
-    def decode(self, state: Tensor) -> Tensor:
-        """(…, D) -> (…, 64, 64, 3) in [−0.5, 0.5], from z alone if `decode_stoch_only` (§4.2, minor 3)."""
-        seen = state[..., self.deter :] if self.decode_stoch_only else state
-        return self.decoder(seen.flatten(0, -2)).unflatten(0, state.shape[:-1])
+    def decoded(self, state: Tensor) -> Tensor:
+        """What the decoder sees of a state: z alone (§4.2, minor 3), or (h, z)."""
+        return state[..., self.deter :] if self.decode_stoch_only else state
 
     def loss(self, batch: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
         """The loss as named, unweighted terms, means over batch and time: Eqs. (3) and (4), and §4.2.
@@ -271,13 +281,15 @@ class WorldModel(nn.Module):
         observed = self.observe(batch["image"], batch["action"], batch["is_first"])
         arrived = (~batch["is_first"]).float()
         seen = torch.ones_like(arrived) if self.observe_first else arrived
-        error = self.decode(observed.state).float() - centre(batch["image"])
+        image = self.decoder.nll(
+            self.decoded(observed.state).flatten(0, 1), batch["image"].flatten(0, 1)
+        )
         predicted = self.reward(observed.state).float().squeeze(-1)
         reward_loss = (
             F.smooth_l1_loss if self.smooth_l1 else lambda *a, **k: 0.5 * F.mse_loss(*a, **k)
         )
         terms = {
-            "image": 0.5 * masked_mean(error.square().flatten(2).sum(-1), seen),
+            "image": masked_mean(image.view_as(seen), seen),
             "reward": masked_mean(
                 reward_loss(predicted, batch["reward"], reduction="none"), arrived
             ),
