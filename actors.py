@@ -1,12 +1,14 @@
 """Actors, critics and exploration: §2.2, §4.1 and the minor modifications 1, 2 and 4 of §4.2.
 
-The stochastic actor maximises the λ-return plus β times the entropy of the states it will visit; the deterministic
-actor, trained beside it, maximises the λ-return alone (Eq. 7). Each has its own critic, fitted on its own imagined
-sequences, since V and Q are of the *current policy*. The entropy comes from mdn.py as a number; what is imagined comes
-from world_model.py as tensors, time first: H steps, N sequences, D state, A action.
+The stochastic actor maximises the λ-return plus β times the entropy of the states it will visit;
+the deterministic actor, trained beside it, maximises the λ-return alone (Eq. 7). Each has its own
+critic, fitted on its own imagined sequences, since V and Q are of the *current policy*. The entropy
+comes from mdn.py as a number; what is imagined comes from world_model.py as tensors, time first: H
+steps, N sequences, D state, A action.
 """
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -20,18 +22,16 @@ from returns import lambda_return, survival
 def mlp(inputs: int, units: int, layers: int, outputs: int) -> nn.Sequential:
     """`layers` hidden ELU layers of `units`, then a linear one, as in Dreamer."""
     sizes = [inputs] + [units] * layers
-    hidden = [
-        m
-        for i, o in zip(sizes, sizes[1:], strict=False)
-        for m in (nn.Linear(i, o), nn.ELU(inplace=True))
-    ]
+    hidden = [m for i, o in pairwise(sizes) for m in (nn.Linear(i, o), nn.ELU(inplace=True))]
     return nn.Sequential(*hidden, nn.Linear(sizes[-1], outputs))
 
 
 class StochasticActor(nn.Module):
-    """π(a | s) = tanh(Normal(μ, σ)), μ = 5 tanh(x / 5), σ = softplus(x + log(e⁵ − 1)) + 1e-4, as in Dreamer.
+    """π(a | s) = tanh(Normal(μ, σ)), as in Dreamer.
 
-    σ is near 5 at first, before the tanh: the untrained policy plays all actions, mostly the extreme ones.
+        μ = 5 tanh(x / 5),   σ = softplus(y + log(e⁵ − 1)) + 1e-4
+
+    σ is near 5 at first: the untrained policy plays all actions, mostly the extreme ones.
     """
 
     def __init__(self, size: int, actions: int, units: int, layers: int = 4):
@@ -53,7 +53,7 @@ class StochasticActor(nn.Module):
 
 
 class DeterministicActor(nn.Module):
-    """A(s) = tanh(5 tanh(x / 5)), §4.1: trained beside the stochastic actor, evaluated in its place."""
+    """A(s) = tanh(5 tanh(x / 5)), trained beside the stochastic actor, evaluated for it (§4.1)."""
 
     def __init__(self, size: int, actions: int, units: int, layers: int = 4):
         super().__init__()
@@ -74,7 +74,7 @@ class QCritic(nn.Module):
         self.net = mlp(size + actions, units, layers, 1)
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
-        """(…, D), (…, A) -> (…). With a ~ π(s) this is a one-sample estimate of V(s) = E_a Q(s, a)."""
+        """(…, D), (…, A) -> (…). At a ~ π(s): a one-sample estimate of V(s) = E_a Q(s, a)."""
         return self.net(torch.cat([state, action], -1)).float().squeeze(-1)
 
 
@@ -86,12 +86,12 @@ class VCritic(nn.Module):
         self.net = mlp(size, units, layers, 1)
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
-        """(…, D), (…, A) -> (…). The action is taken so that either critic can stand in the loop; V ignores it."""
+        """(…, D), (…, A) -> (…). V ignores the action: either critic can stand in the loop."""
         return self.net(state).float().squeeze(-1)
 
 
 def imagined_returns(dream, critic: nn.Module, gamma: float, lam: float) -> Tensor:
-    """R_0 … R_{H−1} of a dream, (H, N), with V(s_k) = Q(s_k, a_k) at the dream's own actions a_k ~ π(s_k)."""
+    """R_0 … R_{H−1} of a dream, (H, N), with V(s_k) = Q(s_k, a_k) at its own a_k ~ π(s_k)."""
     value = critic(dream.state[1:], dream.action[1:])
     return lambda_return(dream.reward, dream.continues, value, gamma, lam)
 
@@ -99,9 +99,9 @@ def imagined_returns(dream, critic: nn.Module, gamma: float, lam: float) -> Tens
 def actor_loss(returns: Tensor, continues: Tensor, first_state_only: bool) -> Tensor:
     """−R, what an actor minimises but for the entropy: a scalar.
 
-    First state only (§4.2): −R_0, averaged over the N starting states. The later actions still receive gradient,
-    through the imagined sequence that R_0 sums over. Otherwise, as in Dreamer, the mean of S_k R_k over all imagined
-    states, S their survival.
+    First state only (§4.2): −R_0, averaged over the N starting states. The later actions still
+    receive gradient, through the imagined sequence that R_0 sums over. Otherwise, as in Dreamer,
+    the mean of S_k R_k over all imagined states, S their survival.
     """
     if first_state_only:
         return -returns[0].mean()
@@ -109,10 +109,12 @@ def actor_loss(returns: Tensor, continues: Tensor, first_state_only: bool) -> Te
 
 
 def critic_loss(critic: nn.Module, dream, returns: Tensor, smooth_l1: bool) -> Tensor:
-    """Regression of the critic on R_0 … R_{H−1}, weighted by survival (§4.2): a scalar, gradient in the critic alone.
+    """Regression of the critic on R_0 … R_{H−1}, weighted by survival (§4.2): a scalar.
 
-    Smooth L1 with its knee at 1 (minor modification 2), or ½(Q − R)². Smooth L1 does not estimate a mean: of
-    returns that are 0 nine times in ten and 10 once it makes 1/9, where the mean is 1.
+    Gradient flows into the critic alone.
+
+    Smooth L1 with its knee at 1 (minor modification 2), or ½(Q − R)². Smooth L1 does not estimate a
+    mean: of returns that are 0 nine times in ten and 10 once it makes 1/9, where the mean is 1.
     """
     value = critic(dream.state[:-1].detach(), dream.action[:-1].detach())
     target = returns.detach()
@@ -127,8 +129,10 @@ def critic_loss(critic: nn.Module, dream, returns: Tensor, smooth_l1: bool) -> T
 def explore(
     action: np.ndarray, noise: float, random_probability: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """The action that collection takes: additive Gaussian noise, clipped to [−1, 1], or with a probability a
-    uniformly random one (minor modification 4 of §4.2)."""
+    """The action that collection takes (§4.2, minor modification 4).
+
+    The given one with Gaussian noise, clipped to [−1, 1], or with a probability a uniform one.
+    """
     if rng.random() < random_probability:
         return rng.uniform(-1, 1, action.shape).astype(np.float32)
     noisy = action + noise * rng.standard_normal(action.shape)

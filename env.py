@@ -1,7 +1,8 @@
 """Experience: environments seen through their pixels, and the replay buffer of what was seen.
 
-The observation is the rendered 64×64 image and nothing else (§5). Rows of experience are arrival-indexed: an
-observation stands beside the action that led to it and the reward and termination received with it.
+The observation is the rendered 64×64 image and nothing else (§5). Rows of experience are
+arrival-indexed: an observation stands beside the action that led to it and the reward and
+termination received with it.
 """
 
 import difflib
@@ -18,13 +19,15 @@ IMAGE_SIZE = 64
 def make_env(env_id: str, action_repeat: int = 2, camera_distance: float | None = None) -> gym.Env:
     """An environment whose observation is its 64×64×3 uint8 image and whose actions lie in [−1, 1].
 
-    Each action is repeated, its rewards summed, up to the end of the episode; `terminated` and `truncated` stay
-    apart. The last step's info["episode"] holds return "r" and length "l" in environment steps.
+    Each action is repeated, its rewards summed, up to the end of the episode; `terminated` and
+    `truncated` stay apart. The last step's info["episode"] holds return "r" and length "l" in
+    environment steps.
 
     Args:
         env_id: any registered environment with bounded `Box` actions that renders `rgb_array`.
         action_repeat: environment steps per decision.
-        camera_distance: metres from the camera to a PyBullet robot (None: the environment's own); nothing elsewhere.
+        camera_distance: metres from the camera to a PyBullet robot (None: the environment's own);
+            nothing elsewhere.
 
     Raises:
         ValueError: in one sentence, what is wrong with `env_id` and what to do.
@@ -41,13 +44,15 @@ def make_env(env_id: str, action_repeat: int = 2, camera_distance: float | None 
         raise ValueError(f"There is no environment {env_id!r}: {hint}") from None
     try:
         env = gym.make(spec, render_mode="rgb_array", disable_env_checker=True)
-    except Exception as error:
-        raise ValueError(f"{env_id} cannot be made to render images: {error}") from error
-    if not isinstance(env.action_space, gym.spaces.Box) or not env.action_space.is_bounded():
-        env.close()
-        raise ValueError(
-            f"{env_id} has actions {env.action_space}, but only a bounded Box of actions can be learnt."
-        )
+        if not isinstance(env.action_space, gym.spaces.Box) or not env.action_space.is_bounded():
+            raise ValueError(f"has actions {env.action_space}: they must be a bounded Box")
+        # PyBullet loads its world at the first reset and restores it at later ones, with other
+        # contacts: after this one, an episode is a function of its seed and actions alone, in this
+        # process or in one that resumes it.
+        env.reset(seed=0)
+        env.render()
+    except Exception as error:  # whatever a foreign environment raises, a missing library above all
+        raise ValueError(f"{env_id} cannot be learnt from its images: {error}.") from error
     if hasattr(
         env.unwrapped, "_render_width"
     ):  # PyBullet: render at our size, never resize from 320×240
@@ -56,9 +61,6 @@ def make_env(env_id: str, action_repeat: int = 2, camera_distance: float | None 
     env = wrappers.RecordEpisodeStatistics(env)
     env = wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
     env = wrappers.RepeatAction(env, action_repeat)
-    # PyBullet loads its world at the first reset and restores it at later ones, with other contacts: after this
-    # one, an episode is a function of its seed and actions alone, in this process or in one that resumes it.
-    env.reset(seed=0)
     env = wrappers.AddRenderObservation(env)
     if env.observation_space.shape != (IMAGE_SIZE, IMAGE_SIZE, 3):
         space = gym.spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
@@ -74,7 +76,8 @@ def resize(image: np.ndarray) -> np.ndarray:
 class Replay:
     """A preallocated ring of rows of experience, sampled as windows of consecutive rows.
 
-    A row is a record of image, action, reward, terminated and is_first: one array, one copy of each observation.
+    A row is a record of image, action, reward, terminated and is_first: one array, one copy of each
+    observation.
 
     Args:
         capacity: rows it holds; older ones are overwritten.
@@ -96,7 +99,7 @@ class Replay:
         return min(self.added, len(self.rows))
 
     def add(self, image, action=0.0, reward=0.0, terminated=False, is_first=False) -> None:
-        """Append one row. The row of a reset: `add(image, is_first=True)`, with action and reward 0."""
+        """Append one row. A reset's has action and reward 0: `add(image, is_first=True)`."""
         row = self.rows[self.added % len(self.rows)]
         row["image"], row["action"], row["reward"] = image, action, reward
         row["terminated"], row["is_first"] = terminated, is_first
@@ -108,9 +111,9 @@ class Replay:
         return self.rows[(self.added - 1) % len(self.rows)]
 
     def sample(self, batch: int, length: int, rng: np.random.Generator) -> np.ndarray:
-        """`batch` windows of `length` consecutive rows, as records (B, T), each window equally likely.
+        """`batch` windows of `length` consecutive rows, each equally likely, as records (B, T).
 
-        Windows may cross episodes; none crosses the write head, where rows are not consecutive in time.
+        Windows may cross episodes; none crosses the write head, where time jumps.
 
         Raises:
             ValueError: if fewer than `length` rows were added.

@@ -1,13 +1,15 @@
-"""The discounted distribution of future states and its entropy: §3 and §4.1, Eqs. (6), (8), (9), (10).
+"""The discounted distribution of future states and its entropy: §3, §4.1, Eqs. (6) to (10).
 
-q(x | s_t) is the discounted occupancy of the states that the policy visits strictly after s_t. A mixture density
-network P(x | s_t) learns it from imagined states (`mdn_loss`), bootstrapping from itself at the last one, and the
-stochastic actor maximises the entropy of P (`entropy`), estimated the same way. This file sees tensors of states
-s = (h, z); it knows neither the world model nor the actors. γ here is γ_q, the discount of q, not that of returns.
+q(x | s_t) is the discounted occupancy of the states that the policy visits strictly after s_t. A
+mixture density network P(x | s_t) learns it from imagined states (`mdn_loss`), bootstrapping from
+itself at the last one, and the stochastic actor maximises the entropy of P (`entropy`), estimated
+the same way. This file sees tensors of states s = (h, z); it knows neither the world model nor the
+actors. γ here is γ_q, the discount of q, not that of returns.
 
-Departures from print, all shown in tests/test_mdn.py: with termination the printed weights do not sum to one; (8)
-and (9) are off by one step; (10) counts s_t itself, an atom of unbounded likelihood in a continuous space, and
-misses step n. And "importance sampling" is bootstrapping, with the ratio q / P taken to be one.
+Departures from print, all shown in tests/test_mdn.py: with termination the printed weights do not
+sum to one; (8) and (9) are off by one step; (10) counts s_t itself, an atom of unbounded likelihood
+in a continuous space, and misses step n. And "importance sampling" is bootstrapping, with the ratio
+q / P taken to be one.
 """
 
 import math
@@ -19,7 +21,7 @@ from torch import Tensor, nn
 
 
 class Mixture(NamedTuple):
-    """A mixture of K diagonal Gaussians over states for each of N conditioning states, in float32."""
+    """A mixture of K diagonal Gaussians over states, for each of N given states; float32."""
 
     log_weights: Tensor  # (N, K) log π, normalised
     mean: Tensor  # (N, K, D)
@@ -28,8 +30,8 @@ class Mixture(NamedTuple):
     def log_prob(self, x: Tensor) -> Tensor:
         """log P(x | s), of shape (M, N), for M points x of shape (M, N, D) per conditioning state.
 
-        Σ_d (x_d − μ_d)² / σ_d² is expanded into two batched matrix products, x² · σ⁻² and x · μσ⁻²: the broadcast
-        (x − μ)² would hold M·N·K·D numbers. At the paper's sizes: 0.14 s instead of 2.0 s, forward and backward.
+        Σ_d (x_d − μ_d)² / σ_d² is expanded into two batched matrix products, x² · σ⁻² and x · μσ⁻²:
+        the broadcast (x − μ)² would hold M·N·K·D numbers.
         """
         assert x.shape[1:] == (self.mean.shape[0], self.mean.shape[2]), (x.shape, self.mean.shape)
         with torch.autocast(x.device.type, enabled=False):
@@ -56,8 +58,8 @@ class MixtureDensityNetwork(nn.Module):
         size: D, numbers in a state.
         components: K.
         units: width of the hidden layers.
-        min_std: floor under σ. h is a deterministic function of what came before it, so the true density is
-            singular and its likelihood unbounded: without a floor, −log P has no minimum.
+        min_std: floor under σ. h is a deterministic function of what came before it, so the true
+            density is singular and its likelihood unbounded: without a floor −log P has no minimum.
     """
 
     def __init__(self, size: int, components: int = 8, units: int = 256, min_std: float = 0.1):
@@ -79,11 +81,12 @@ class MixtureDensityNetwork(nn.Module):
 
 
 def discounted_weights(continues: Tensor, gamma: float) -> tuple[Tensor, Tensor]:
-    """Weights of the n imagined states and of the bootstrap in q(· | s_t): Eqs. (8)–(10) with termination.
+    """Weights of the n imagined states and of the bootstrap in q(· | s_t): Eqs. (8) to (10).
 
         m_0 = 1,  m_k = Π_{j≤k} γ c_{t+j};   w_k = m_{k−1} − m_k,  w_b = m_n;   Σ_k w_k + w_b = 1
 
-    Without termination w_k = (1 − γ) γ^{k−1} and w_b = γ^n; where the episode ends, the unspent mass stays.
+    Without termination w_k = (1 − γ) γ^{k−1} and w_b = γ^n; where the episode ends, the unspent
+    mass stays.
 
     Args:
         continues: (n, N) c of s_{t+1} … s_{t+n}.
@@ -103,8 +106,8 @@ def cross_entropy(
 
         −Σ_k w_k log P(s_{t+k} | s_t) − w_b E_{s̃ ~ P(· | s_{t+n})} log P(s̃ | s_t)
 
-    s̃ is not one draw: its K components are enumerated, each sampled once and weighted by its π, so the estimate is
-    unbiased in π's gradient too (drawing a component would lose it).
+    s̃ is not one draw: its K components are enumerated, each sampled once and weighted by its π, so
+    the estimate is unbiased in π's gradient too (drawing a component would lose it).
 
     Args:
         density: P(· | s_t).
@@ -123,7 +126,9 @@ def cross_entropy(
 
 
 def mdn_loss(mdn: MixtureDensityNetwork, states: Tensor, continues: Tensor, gamma: float) -> Tensor:
-    """Negative log-likelihood that the MDN minimises, Eq. (10): (N,) nats, gradient in the online MDN alone.
+    """Negative log-likelihood that the MDN minimises, Eq. (10): (N,) nats.
+
+    Gradient flows into the online MDN alone.
 
     Args:
         mdn: the online network.
@@ -142,8 +147,9 @@ def entropy(
 ) -> Tensor:
     """Ĥ of the discounted state distribution, the second term of the objective (7): (N,) nats.
 
-    Gradient flows to the policy through the imagined states, their c and s̃ ~ P_T(· | s_{t+n}). It could not flow
-    through samples of P_T(· | s_t): those do not depend on what the policy does after s_t.
+    Gradient flows to the policy through the imagined states, their c and s̃ ~ P_T(· | s_{t+n}). It
+    could not flow through samples of P_T(· | s_t): those do not depend on what the policy does
+    after s_t.
 
     Args:
         target: P_T, the target network, whose parameters do not require gradient.

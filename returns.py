@@ -1,7 +1,7 @@
 """Returns of an imagined sequence: the λ-return with termination (Eq. 5) and survival (§4.2).
 
-Pure functions of tensors, time first. Everything is arrival-indexed, as the whole code is: row k of `reward` and
-of `continues` belongs to the state s_{t+k+1} that the k-th imagined action led to.
+Pure functions of tensors, time first. Everything is arrival-indexed, as the whole code is: row k of
+`reward` and of `continues` belongs to the state s_{t+k+1} that the k-th imagined action led to.
 """
 
 import torch
@@ -25,8 +25,8 @@ def lambda_return(
     Returns:
         (H, N) R_0 … R_{H−1}.
 
-    Departure from print: the unnumbered definition above Eq. (5) has weights that sum to 1 + λ^T (1 − λ). Eq. (5)
-    is right, and this is Eq. (5) as a recursion, for every state at once, with c in the place of 1.
+    Departure from print: the weights of the unnumbered definition above Eq. (5) sum to
+    1 + λ^T (1 − λ). Eq. (5) is right; this is Eq. (5) as a recursion, with c in the place of 1.
     """
     assert reward.shape == continues.shape == value.shape, (
         reward.shape,
@@ -43,7 +43,7 @@ def lambda_return(
 
 
 def survival(continues: Tensor) -> Tensor:
-    """Probability S that the imagined episode has not ended before each state (§4.2), without gradient.
+    """Probability S that the imagined episode has reached each state (§4.2), without gradient.
 
         S_0 = 1;   S_k = c_1 c_2 … c_k
 

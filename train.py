@@ -58,7 +58,7 @@ Collect = Literal["explorer", "both"]
 # fmt: off
 @dataclass(frozen=True)
 class Settings:
-    """All that a run depends on. §: of the paper; Dreamer: its authors' code; ours: both are silent."""
+    """All that a run depends on. §: in the paper; Dreamer: its authors' code; ours: in neither."""
 
     env: str = "HopperBulletEnv-v0"  # Gymnasium id; bounded Box actions, rgb_array rendering
     arm: Arm = "maxent"  # curve of the paper's figure: sets the switches below
@@ -116,7 +116,7 @@ class Settings:
     critic_lr: float = 8e-5  # of each critic (Dreamer)
     mdn_lr: float = 2e-4  # of the mixture density network (§5)
     grad_clip: float = 100.0  # largest global gradient norm of an optimiser step (Dreamer)
-    free_nats: float = 3.0  # KL below this costs nothing; the original Dreamer's `kl` only (Dreamer)
+    free_nats: float = 3.0  # KL below this costs nothing; of `kl` only (Dreamer)
     reward_weight: float = 1.0  # weight of the reward's loss (Dreamer)
     kl_weight: float = 1.0  # of `kl`, the original Dreamer's divergence (Dreamer)
     kl_standard_weight: float = 0.1  # of KL(posterior || N(0, 1)) (§5)
@@ -218,8 +218,9 @@ class Agent(nn.Module):
         loss.backward(inputs=parameters)  # through other networks, but into no other's gradients
         norm = nn.utils.clip_grad_norm_(parameters, self.s.grad_clip)
         metrics[f"{name}/grad_norm"] = norm
-        if not torch.isfinite(norm):
-            wrong = [key for key, value in metrics.items() if not torch.isfinite(value)]
+        if not torch.isfinite(norm + loss):
+            named = metrics | {f"{name}/loss": loss}
+            wrong = [key for key, value in named.items() if not torch.isfinite(value)]
             raise FloatingPointError(f"Not finite: {', '.join(wrong)}.")
         optimiser.step()
 
@@ -340,9 +341,9 @@ class Run:
     """All that a run is: environments, agent, replay, random states, counters, and its folder.
 
     The folder holds settings.json; metrics.csv, a row an evaluation; TensorBoard events of the same
-    names; the last two checkpoints; and replay.bin, to which each checkpoint appends the rows that
-    are new. A checkpoint knows how long the two growing files were: what is longer is cut off
-    when the run is resumed.
+    names; weights.pt at the end; the last two checkpoints; and replay.bin, to which each checkpoint
+    appends the rows that are new. A checkpoint knows how long the two growing files were: what is
+    longer is cut off when the run is resumed.
     """
 
     CHECKPOINTS = ("checkpoint.pt", "checkpoint.previous.pt")
@@ -574,6 +575,7 @@ def train(run: Run, stop: Callable[[], bool]) -> None:
             run.save()
             saved_at = time.monotonic()
     run.save()
+    torch.save(agent.state_dict(), run.folder / "weights.pt")
 
 
 def passed(before: int, after: int, every: int) -> int:

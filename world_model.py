@@ -1,20 +1,26 @@
-"""The world model: §2.2 with the modifications of §4.2. Encoder, RSSM, decoder, reward and termination heads; Eqs. (3), (4).
+"""The world model: §2.2 with the modifications of §4.2; Eqs. (3) and (4).
 
-What it does: turns sequences of images into states s = (h, z) (`observe`), continues them without images under a
-policy (`imagine`), and says how wrong it is, as named terms (`WorldModel.loss`). It knows no actor, no setting and no
-optimiser.
+Encoder, recurrent state-space model (RSSM), decoder, reward and termination heads.
 
-Time is arrival-indexed. Row t of an episode holds the observation o_t, the action a_{t−1} that led to it, and the
-reward and termination received on arriving there; the first row has action 0 and `is_first`.
+It turns sequences of images into states s = (h, z) (`observe`), continues them without images under
+a policy (`imagine`), and says how wrong it is, as named terms (`WorldModel.loss`). It knows no
+actor, no setting and no optimiser.
 
-    h_t = GRU(dense(z_{t−1}, a_{t−1}), h_{t−1}), h_0 = 0;   z_t ~ p(z | h_t, o_t) learning and acting, p(z | h_t) imagining
+Time is arrival-indexed. Row t of an episode holds the observation o_t, the action a_{t−1} that led
+to it, and the reward and termination received on arriving there; the first row has action 0 and
+`is_first`.
+
+    h_t = GRU(dense(z_{t−1}, a_{t−1}), h_{t−1}),   h_0 = 0
+    z_t ~ p(z | h_t, o_t) learning and acting;   z_t ~ p(z | h_t) imagining
     r(s_t), d(s_t): reward and end of the episode "for achieving state s_t";   c = 1 − d
 
-Tensor legend of the whole code: B sequences, T steps of a sequence, N starting states, H horizon, K mixture
-components, D = deter + stoch, A action dimensions. Batch first in replay (B, T, …), time first in imagination (H, N, …).
+Tensor legend of the whole code: B sequences, T steps of a sequence, N starting states, H horizon, K
+mixture components, D = deter + stoch, A action dimensions. Batch first in replay (B, T, …), time
+first in imagination (H, N, …).
 """
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -22,7 +28,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.distributions import Normal, kl_divergence
 
-SLICE = 256  # images through the convolutions at once: their activations then stay in the processor's cache
+SLICE = 256  # images through the convolutions at once: what they leave then fits a CPU's cache
 
 
 class Observed(NamedTuple):
@@ -37,7 +43,7 @@ class Dream(NamedTuple):
     """What `imagine` makes of N starting states s_0."""
 
     state: Tensor  # (H + 1, N, D) s_0 … s_H
-    action: Tensor  # (H + 1, N, A) a_k = π(s_k); a_H is chosen and never taken, for V(s_H) = Q(s_H, a_H)
+    action: Tensor  # (H + 1, N, A) a_k = π(s_k); a_H is chosen for V(s_H) = Q(s_H, a_H), not taken
     reward: Tensor  # (H, N) r(s_1) … r(s_H)
     continues: Tensor  # (H, N) c = 1 − d in s_1 … s_H
 
@@ -49,14 +55,13 @@ def in_slices(function: Callable[..., Tensor], *inputs: Tensor) -> Tensor:
 
 
 class Encoder(nn.Module):
-    """64×64 images to embeddings: four 4×4 convolutions of stride 2 with depth, 2, 4 and 8·depth channels, ReLU."""
+    """64×64 images to embeddings: four 4×4 convolutions of stride 2 with ReLU, of depth, 2·depth,
+    4·depth and 8·depth channels."""
 
     def __init__(self, depth: int):
         super().__init__()
         channels = [3, depth, 2 * depth, 4 * depth, 8 * depth]
-        convolutions = [
-            nn.Conv2d(i, o, 4, stride=2) for i, o in zip(channels, channels[1:], strict=False)
-        ]
+        convolutions = [nn.Conv2d(i, o, 4, stride=2) for i, o in pairwise(channels)]
         self.net = nn.Sequential(*[m for c in convolutions for m in (c, nn.ReLU())], nn.Flatten())
         self.net.to(memory_format=torch.channels_last)
         self.size = 8 * depth * 2 * 2
@@ -67,9 +72,11 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """States to images: a linear layer, then transposed convolutions of kernels 5, 5, 6, 6 and stride 2, ReLU.
+    """States to images: a linear layer, then transposed convolutions of kernels 5, 5, 6, 6, stride
+    2 and ReLU.
 
-    The first transposed convolution acts on a 1×1 map, where it is a linear layer, and is written as one.
+    The first transposed convolution acts on a 1×1 map, where it is a linear layer, and is written
+    as one.
     """
 
     def __init__(self, inputs: int, depth: int):
@@ -92,7 +99,10 @@ class Decoder(nn.Module):
         return self.net(maps).permute(0, 2, 3, 1).float()
 
     def nll(self, x: Tensor, image: Tensor) -> Tensor:
-        """½ Σ (o − o')² over pixels, −log Normal(o'; o, 1) but for a constant: (M, inputs), (M, 64, 64, 3) -> (M,)."""
+        """½ Σ (o − o')² over pixels, which is −log Normal(o; o', 1) but for a constant.
+
+        (M, inputs), (M, 64, 64, 3) uint8 -> (M,)
+        """
 
         def part(x: Tensor, image: Tensor) -> Tensor:
             return 0.5 * (self(x) - centre(image)).square().flatten(1).sum(1)
@@ -106,7 +116,7 @@ def centre(image: Tensor) -> Tensor:
 
 
 def normal(statistics: Tensor) -> Normal:
-    """(…, 2 · stoch) to a diagonal Gaussian of (…, stoch) in float32, std = softplus + 0.1 as in Dreamer."""
+    """(…, 2·stoch) to a diagonal Gaussian of (…, stoch), float32, std softplus + 0.1 (Dreamer)."""
     mean, std = statistics.float().chunk(2, -1)
     return Normal(mean, F.softplus(std) + 0.1, validate_args=False)
 
@@ -114,11 +124,7 @@ def normal(statistics: Tensor) -> Normal:
 def mlp(inputs: int, units: int, layers: int, outputs: int) -> nn.Sequential:
     """`layers` hidden ELU layers of `units`, then a linear one, as in Dreamer."""
     sizes = [inputs] + [units] * layers
-    hidden = [
-        m
-        for i, o in zip(sizes, sizes[1:], strict=False)
-        for m in (nn.Linear(i, o), nn.ELU(inplace=True))
-    ]
+    hidden = [m for i, o in pairwise(sizes) for m in (nn.Linear(i, o), nn.ELU(inplace=True))]
     return nn.Sequential(*hidden, nn.Linear(sizes[-1], outputs))
 
 
@@ -132,10 +138,12 @@ class WorldModel(nn.Module):
         units: units of the reward and termination heads.
         depth: channels of the first convolution.
         termination: learn when episodes end (§4.2); without it c = 1 everywhere.
-        fixed_prior: KL to N(0, 1) and Jeffreys to the learnt prior (§4.2), in the place of KL to the learnt prior.
+        fixed_prior: KL to N(0, 1) and Jeffreys to the learnt prior (§4.2), in the place of KL to
+            the learnt prior.
         smooth_l1: Smooth L1 loss of the reward (§4.2, minor 2), in the place of ½(r − r')².
         decode_stoch_only: the decoder sees z alone (§4.2, minor 3), in the place of (h, z).
-        observe_first: z_0 is inferred from o_0, so a_0 depends on it (§4.2). Without it s_0 = (0, 0) and o_0 is never seen.
+        observe_first: z_0 is inferred from o_0, so a_0 depends on it (§4.2). Without it s_0 is
+            zero and o_0 is never seen.
         free_nats: KL below which there is nothing to gain (Dreamer); with `fixed_prior` unused.
     """
 
@@ -176,13 +184,13 @@ class WorldModel(nn.Module):
         self.termination = mlp(self.size, units, 3, 1) if termination else None
 
     def recur(self, deter: Tensor, stoch: Tensor, action_share: Tensor) -> Tensor:
-        """h_t = GRU(dense(z_{t−1}, a_{t−1}), h_{t−1}), the action's share of the dense layer given."""
+        """h_t = GRU(dense(z_{t−1}, a_{t−1}), h_{t−1}), given the action's share of the dense."""
         return self.gru(F.elu(self.dense_stoch(stoch) + action_share), deter)
 
     def observe(
         self, image: Tensor, action: Tensor, is_first: Tensor, previous: Tensor | None = None
     ) -> Observed:
-        """States of B sequences; the state is reset where an episode starts, so sequences may cross episodes.
+        """States of B sequences, which may cross episodes: the state is reset where one starts.
 
         Args:
             image: (B, T, 64, 64, 3) uint8.
@@ -203,7 +211,7 @@ class WorldModel(nn.Module):
         deter, stoch = previous.split([self.deter, self.stoch], -1)
         deters, stochs, statistics = [], [], []
         for t in range(length):
-            # h_0 = 0: nothing of the episode before passes, in h nor in z, which enters through h alone
+            # h_0 = 0: nothing of the episode before passes, nor of its z, which enters by h alone
             deter = going_on[:, t] * self.recur(deter, stoch, action_share[:, t])
             out = self.posterior_out(F.elu(self.posterior_deter(deter) + embed_share[:, t]))
             posterior = normal(out)
@@ -250,7 +258,7 @@ class WorldModel(nn.Module):
         return self.reward(state).float().squeeze(-1)
 
     def predict_continues(self, state: Tensor) -> Tensor:
-        """c(s) = 1 − d(s): (…, D) -> (…), the probability that the episode goes on from the state."""
+        """c(s) = 1 − d(s), the probability that the episode goes on: (…, D) -> (…)."""
         if self.termination is None:
             return torch.ones(state.shape[:-1], device=state.device)
         return torch.sigmoid(-self.termination(state).float()).squeeze(-1)
@@ -260,20 +268,21 @@ class WorldModel(nn.Module):
         return state[..., self.deter :] if self.decode_stoch_only else state
 
     def loss(self, batch: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
-        """The loss as named, unweighted terms, means over batch and time: Eqs. (3) and (4), and §4.2.
+        """The loss as named, unweighted means over batch and time: Eqs. (3), (4) and §4.2.
 
-            image        ½ Σ (o − o')² over pixels: −log Normal(o', 1) but for a constant
-            reward       Smooth L1, or ½(r − r')²; not on first rows, which arrive with none
-            termination  binary cross-entropy on `terminated`, never on `truncated`; not on first rows
-            kl_standard  KL(posterior ‖ N(0, 1))                         §4.2; gives the prior no gradient
-            jeffreys     KL(posterior ‖ prior) + KL(prior ‖ posterior)     §4.2
-            kl           max(KL(posterior ‖ prior), free nats), in the place of the last two in the original Dreamer
+            image        ½ Σ (o − o')² over pixels
+            reward       Smooth L1, or ½ (r − r')²; first rows arrive with none
+            termination  binary cross-entropy on `terminated`, never on `truncated`; likewise
+            kl_standard  KL(posterior ‖ N(0, 1)), which gives the prior no gradient (§4.2)
+            jeffreys     KL(posterior ‖ prior) + KL(prior ‖ posterior) (§4.2)
+            kl           max(KL(posterior ‖ prior), free nats), Dreamer's, in place of the last two
 
-        Departures from print: the sign before KL in (4); the prior of step t + 1 in (3) lacks the action, which
-        h_{t+1} holds.
+        Departures from print: the sign before KL in (4); the prior of step t + 1 in (3) lacks the
+        action, which h_{t+1} holds.
 
         Args:
-            batch: image (B, T, 64, 64, 3) uint8; action (B, T, A), reward, terminated, is_first (B, T).
+            batch: image (B, T, 64, 64, 3) uint8; action (B, T, A), reward, terminated, is_first (B,
+                T).
 
         Returns:
             the terms, and the posterior states (B, T, D).

@@ -1,0 +1,397 @@
+"""The four arms, the two presets, one update of each, against the table of the paper's figure."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from env import Replay
+from train import (
+    ARMS,
+    PRESETS,
+    Agent,
+    Settings,
+    act,
+    beta_at,
+    default_settings,
+    interval95,
+    to_tensors,
+    update,
+)
+
+# What each arm sets, in this order. All four see o_0 before a_0, as the authors' own Dreamer does
+# though the paper says otherwise: the blind first action is the other side of a switch, no arm.
+NAMES = "dreamer", "dreamer-maxent", "revised", "maxent"
+TABLE = {
+    "termination": (False, False, True, True),
+    "fixed_prior": (False, False, True, True),
+    "q_critic": (False, False, True, True),
+    "smooth_l1": (False, False, True, True),
+    "decode_stoch_only": (False, False, True, True),
+    "first_state_only": (False, False, True, True),
+    "stoch": (30, 30, 128, 128),
+    "entropy": (False, True, False, True),
+    "deterministic_actor": (False, True, False, True),
+    "action_noise": (0.3, 0.0, 0.3, 0.0),
+    "random_action": (0.0, 0.0, 0.1, 0.1),
+}
+# What the paper, or the authors' Dreamer where the paper is silent, gives for every arm.
+PAPER = dict(
+    observe_first=True, action_repeat=2, deter=200, hidden=200, units=400, depth=32, batch_size=50,
+    length=50, horizon=15, prefill=5000, train_every=1000, updates=100, steps=1_000_000, gamma=0.99,
+    lam=0.95, gamma_q=0.9, beta_start=0.2, beta_end=0.0001, mdn_components=8, mdn_units=256,
+    target_rate=0.1, model_lr=6e-4, actor_lr=8e-5, critic_lr=8e-5, mdn_lr=2e-4, grad_clip=100,
+    free_nats=3, reward_weight=1, kl_weight=1, kl_standard_weight=0.1, jeffreys_weight=0.1,
+    eval_episodes=10,
+)  # fmt: skip
+SIZES = {"deter", "stoch", "hidden", "units", "depth", "batch_size", "length", "mdn_units"}
+CADENCE = {"steps", "prefill", "train_every", "updates", "eval_every"}
+ACTIONS = 2
+
+
+def tiny(arm: str, **changes) -> Settings:
+    small = dict(
+        deter=8, stoch=4, hidden=8, units=8, depth=2, batch_size=3, length=6, horizon=3, mdn_units=8
+    )
+    return dataclasses.replace(default_settings(arm), **(small | changes))
+
+
+def make_agent(s: Settings, bfloat16: bool = False) -> Agent:
+    torch.manual_seed(0)
+    return Agent(s, ACTIONS, torch.device("cpu"), bfloat16)
+
+
+def make_batch(s: Settings) -> dict[str, torch.Tensor]:
+    """Windows of random episodes of seven rows, the last of them terminal."""
+    rng, replay = np.random.default_rng(0), Replay(40, ACTIONS)
+    for i in range(40):
+        image = rng.integers(256, size=(64, 64, 3))
+        if i % 7 == 0:
+            replay.add(image, is_first=True)
+        else:
+            replay.add(image, rng.uniform(-1, 1, ACTIONS), rng.normal(), terminated=i % 7 == 6)
+    batch = to_tensors(replay.sample(s.batch_size, s.length, rng), torch.device("cpu"))
+    assert batch["terminated"].any() and batch["is_first"].any()
+    return batch
+
+
+def networks(agent: Agent) -> dict[str, torch.nn.Module]:
+    """Every network by the name of its optimiser, and the target MDN, which has none."""
+    named = {"model": agent.model}
+    named |= {f"{name}_actor": net for name, net in agent.actors.items()}
+    named |= {f"{name}_critic": net for name, net in agent.critics.items()}
+    if hasattr(agent, "mdn"):
+        named |= {"mdn": agent.mdn, "target_mdn": agent.target_mdn}
+    assert sum(len(list(net.parameters())) for net in named.values()) == len(
+        list(agent.parameters())
+    )
+    return named
+
+
+def snapshot(agent: Agent, what=lambda p: p.detach()) -> dict[str, list[torch.Tensor]]:
+    """A copy of something of every parameter, by network."""
+    return {
+        name: [torch.clone(what(p)) for p in net.parameters()]
+        for name, net in networks(agent).items()
+    }
+
+
+def gradients(agent: Agent) -> dict[str, list[torch.Tensor]]:
+    return snapshot(agent, lambda p: torch.zeros_like(p) if p.grad is None else p.grad)
+
+
+def changed(before, after) -> set[str]:
+    """Networks of which anything differs between two snapshots."""
+    return {
+        name
+        for name in before
+        if not all(torch.equal(a, b) for a, b in zip(before[name], after[name], strict=True))
+    }
+
+
+def updated(s: Settings, beta=0.1, bfloat16=False) -> tuple[Agent, dict[str, float]]:
+    agent = make_agent(s, bfloat16)
+    torch.manual_seed(1)
+    return agent, update(agent, make_batch(s), beta, s)
+
+
+def watched_update(s: Settings, watch) -> dict[str, float]:
+    """One update, of whose every step watch(agent, name, loss, step) makes what it likes."""
+    agent = make_agent(s)
+    step = agent.step
+    agent.step = lambda name, *rest: watch(agent, name, rest[0], lambda: step(name, *rest))
+    return update(agent, make_batch(s), 0.1, s)
+
+
+# --- settings ---
+
+
+def test_arms_differ_as_in_the_table_and_in_nothing_else():
+    arms = {name: dataclasses.asdict(default_settings(name, "paper")) for name in NAMES}
+    assert tuple(ARMS) == NAMES
+    for field, values in TABLE.items():
+        assert tuple(arms[name][field] for name in NAMES) == values, field
+    differing = {f for f in arms["maxent"] if len({arms[name][f] for name in NAMES}) > 1}
+    assert differing == {"arm", *TABLE}
+
+
+@pytest.mark.parametrize("arm", NAMES)
+def test_paper_preset_holds_the_papers_numbers(arm):
+    s = dataclasses.asdict(default_settings(arm, "paper"))
+    assert {name: s[name] for name in PAPER} == PAPER
+
+
+@pytest.mark.parametrize("arm", NAMES)
+def test_presets_change_sizes_and_cadence_and_no_coefficient(arm):
+    small, paper = (dataclasses.asdict(default_settings(arm, name)) for name in PRESETS)
+    differing = {name for name in small if small[name] != paper[name]}
+    assert differing and differing <= SIZES | CADENCE | {"preset"}
+    assert all(small[name] <= paper[name] for name in differing & SIZES)
+
+
+def test_maxent_is_the_default():
+    assert default_settings() == default_settings("maxent", "small")
+    assert (Settings().arm, Settings().preset) == ("maxent", "small")
+
+
+@pytest.mark.parametrize("arm", NAMES)
+def test_arms_hold_the_networks_of_the_table_and_evaluate_the_right_actor(arm):
+    s = tiny(arm)
+    agent = make_agent(s)
+    with_entropy = arm in ("dreamer-maxent", "maxent")
+    actors = ["stochastic", "deterministic"] if with_entropy else ["stochastic"]
+    assert list(agent.actors) == list(agent.critics) == actors
+    assert agent.evaluated is agent.actors[actors[-1]]
+    assert hasattr(agent, "mdn") == hasattr(agent, "target_mdn") == with_entropy
+    assert (agent.model.termination is not None) == (arm in ("revised", "maxent"))
+    critic = agent.critics["stochastic"].net[0].in_features
+    assert critic == 8 + s.stoch + ACTIONS * (arm in ("revised", "maxent"))  # Q(s, a) or V(s)
+
+
+@pytest.mark.parametrize("observe_first", [True, False])
+def test_first_action_depends_on_the_first_observation_unless_blind(observe_first):
+    agent = make_agent(tiny("maxent", observe_first=observe_first))
+    actions = []
+    for pixel in (0, 255):
+        torch.manual_seed(0)
+        image, zeros = np.full((64, 64, 3), pixel, np.uint8), np.zeros(ACTIONS, np.float32)
+        actions.append(act(agent, agent.evaluated.mode, image, zeros, None)[0])
+    assert (actions[0] != actions[1]).all() == observe_first
+    assert np.array_equal(*actions) != observe_first
+
+
+def test_beta_falls_linearly_from_a_fifth_to_a_ten_thousandth():
+    s = default_settings("maxent", "paper")
+    betas = [beta_at(step, s) for step in (0, 500_000, 1_000_000, 1_000_007)]
+    assert betas == pytest.approx([0.2, 0.10005, 0.0001, 0.0001], abs=1e-12)
+
+
+def test_interval_is_students():
+    returns = np.array([12.0, 15.5, 9.0, 20.0, 11.0, 13.0, 8.5, 17.0, 14.0, 10.0])
+    scale = returns.std(ddof=1) / math.sqrt(10)
+    low, high = stats.t.interval(0.95, 9, loc=returns.mean(), scale=scale)
+    assert interval95(returns) == pytest.approx((high - low) / 2)
+    assert math.isnan(interval95(returns[:1]))
+
+
+# --- one update ---
+
+
+@pytest.mark.parametrize("bfloat16", [False, True])
+@pytest.mark.parametrize("arm", NAMES)
+def test_one_update_moves_every_parameter_of_every_network(arm, bfloat16):
+    s = tiny(arm, free_nats=0.0)  # so that the original KL, small at first, has a gradient
+    before = snapshot(make_agent(s))
+    agent, metrics = updated(s, bfloat16=bfloat16)
+    for name, net in networks(agent).items():
+        for old, (path, new) in zip(before[name], net.named_parameters(), strict=True):
+            assert not torch.equal(old, new), f"{name}.{path}"
+    assert all(math.isfinite(value) for value in metrics.values())
+
+
+def test_target_mdn_starts_as_the_online_one_and_moves_a_tenth_of_the_way_to_it():
+    s = tiny("maxent")
+    (agent, _), before = updated(s), snapshot(make_agent(s))
+    assert len(before["mdn"]) == len(before["target_mdn"]) == 6
+    assert all(torch.equal(*pair) for pair in zip(before["mdn"], before["target_mdn"], strict=True))
+    assert not any(p.requires_grad for p in agent.target_mdn.parameters())
+    after = snapshot(agent)
+    for old, online, target in zip(
+        before["target_mdn"], after["mdn"], after["target_mdn"], strict=True
+    ):
+        torch.testing.assert_close(target, 0.9 * old + 0.1 * online)
+
+
+@pytest.mark.parametrize("arm", NAMES)
+def test_each_step_of_an_update_touches_only_its_own_network(arm):
+    """No actor's loss leaves a gradient in model, critic or MDN; no step moves another network."""
+    steps = []
+
+    def watch(agent, name, loss, step):
+        parameters, grads = snapshot(agent), gradients(agent)
+        step()
+        assert changed(parameters, snapshot(agent)) == {name}
+        assert changed(grads, gradients(agent)) == {name}
+        steps.append(name)
+
+    s = tiny(arm)
+    watched_update(s, watch)
+    assert sorted(steps) == sorted(networks(make_agent(s)).keys() - {"target_mdn"})
+
+
+def test_a_step_is_adams_on_the_clipped_gradient_of_its_own_loss():
+    """Adam steps by its learning rate against the sign of a gradient that stays the same."""
+    s = tiny("maxent", grad_clip=0.5)
+    agent = make_agent(s)
+    rates = dict(model=s.model_lr, mdn=s.mdn_lr, actor=s.actor_lr, critic=s.critic_lr)
+    for name in agent.optimisers:
+        parameters = list(networks(agent)[name].parameters())
+        size = sum(p.numel() for p in parameters)
+        for _ in range(2):  # the second does not add to the gradient of the first
+            before, metrics = snapshot(agent), {}
+            agent.step(name, sum(7 * p.sum() for p in agent.parameters()), metrics)
+            norm = metrics[f"{name}/grad_norm"].item()
+            assert norm == pytest.approx(7 * math.sqrt(size), rel=1e-4)  # before clipping
+            clipped = torch.cat([p.grad.flatten() for p in parameters])
+            assert clipped.norm().item() == pytest.approx(0.5, rel=1e-3)
+            assert changed(before, snapshot(agent)) == {name}
+            for old, p in zip(before[name], parameters, strict=True):
+                rate = torch.full_like(p, rates[name.split("_")[-1]])
+                torch.testing.assert_close(old - p, rate, rtol=0.02, atol=0)
+
+
+@pytest.mark.parametrize("arm", NAMES)
+def test_losses_are_the_weighted_sums_of_their_named_terms(arm):
+    """Model: §2's coefficients, 0.1 and 0.1 or 1. Actors: −R_0, the stochastic one's − β Ĥ."""
+    losses = {}
+
+    def watch(agent, name, loss, step):
+        losses[name] = loss.item()
+        step()
+
+    metrics = watched_update(tiny(arm, kl_weight=1.5, reward_weight=2.0), watch)
+    terms = {k.removeprefix("model/"): v for k, v in metrics.items() if k.startswith("model/")}
+    del terms["grad_norm"]
+    revised = arm in ("revised", "maxent")
+    names = {"image", "reward"} | (
+        {"termination", "kl_standard", "jeffreys"} if revised else {"kl"}
+    )
+    weights = {"kl_standard": 0.1, "jeffreys": 0.1, "kl": 1.5, "reward": 2.0}
+    assert terms.keys() == names
+    total = sum(weights.get(name, 1) * term for name, term in terms.items())
+    assert losses["model"] == pytest.approx(total, rel=1e-6)
+    if revised:  # first state only
+        expected = -metrics["stochastic_actor/return"]
+        if arm == "maxent":
+            assert abs(metrics["mdn/entropy"]) > 0.1
+            expected -= 0.1 * metrics["mdn/entropy"]
+            deterministic = -metrics["deterministic_actor/return"]
+            assert losses["deterministic_actor"] == pytest.approx(deterministic)
+        assert losses["stochastic_actor"] == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_online_mdn_learns_and_the_target_mdn_rewards():
+    def metrics(perturbed):
+        s = tiny("maxent")
+        agent = make_agent(s)
+        for p in networks(agent)[perturbed].parameters() if perturbed else ():
+            p.data += 0.1
+        torch.manual_seed(1)
+        return update(agent, make_batch(s), 0.1, s)
+
+    plain, online, target = metrics(None), metrics("mdn"), metrics("target_mdn")
+    assert online["mdn/entropy"] == plain["mdn/entropy"] != target["mdn/entropy"]
+    assert target["mdn/nll"] == plain["mdn/nll"] != online["mdn/nll"]
+
+
+def test_beta_moves_the_stochastic_actor_and_not_the_deterministic_one():
+    """Eq. (7): the entropy is the stochastic actor's alone."""
+    for arm in ("dreamer-maxent", "maxent"):
+        (one, _), (other, _) = (updated(tiny(arm), beta) for beta in (0.0, 0.2))
+        assert changed(snapshot(one), snapshot(other)) == {"stochastic_actor"}
+
+
+def test_terminal_states_start_no_dream():
+    s = tiny("maxent")
+    agent, batch, starts = make_agent(s), make_batch(s), []
+    loss, imagine = agent.model.loss, agent.model.imagine
+    agent.model.loss = lambda batch: starts.append(loss(batch)) or starts[-1]
+    agent.model.imagine = lambda start, *rest: starts.append(start) or imagine(start, *rest)
+    update(agent, batch, 0.1, s)
+    (_, states), *starts = starts
+    assert len(starts) == 2
+    for start in starts:
+        assert not start.requires_grad
+        assert torch.equal(start, states[~batch["terminated"]])
+
+
+def test_first_action_of_the_deterministic_dream_is_noisy_and_stays_in_range():
+    """Q is asked at a = A(s) alone: its ∂Q/∂a needs actions beside it (a departure)."""
+    for noise, saturates in ((0.1, False), (5.0, True)):
+        s = tiny("maxent", first_action_noise=noise, batch_size=50)
+        agent, dreams = make_agent(s), []
+        with torch.no_grad():  # actions near 0, so that little noise is not clipped
+            agent.actors["deterministic"].net[-1].weight.mul_(0.01)
+        imagine = agent.model.imagine
+        agent.model.imagine = lambda start, policy, *rest, imagine=imagine, dreams=dreams: (
+            dreams.append((imagine(start, policy, *rest), policy(start))) or dreams[-1][0]
+        )
+        update(agent, make_batch(s), 0.1, s)
+        _, (dream, chosen) = dreams
+        added = (dream.action[0] - chosen).detach().flatten().numpy()
+        assert dream.action.abs().max() <= 1
+        assert (dream.action[0].abs() == 1).any() == saturates
+        assert (stats.kstest(added / noise, "norm").pvalue > 0.001) != saturates
+
+
+# --- what is not finite ---
+
+
+def all_state(agent: Agent):
+    """Parameters and the optimisers' own state, flat."""
+    moments = [
+        value
+        for optimiser in agent.optimisers.values()
+        for of_parameter in optimiser.state.values()
+        for value in of_parameter.values()
+    ]
+    return [t.detach().clone() for t in (*agent.parameters(), *moments)]
+
+
+@pytest.mark.parametrize("name", make_agent(tiny("maxent")).optimisers)
+def test_a_loss_or_gradient_that_is_not_finite_is_refused_by_name_and_changes_nothing(name):
+    agent, _ = updated(tiny("maxent"))
+    before = all_state(agent)
+    parameters = list(networks(agent)[name].parameters())
+    total = sum(p.sum() for p in parameters)
+    no_number = total * math.nan
+    steep = (total - total.detach()).abs().sqrt()  # 0, of slope ∞ · 0
+    for loss in (no_number, steep):
+        with pytest.raises(FloatingPointError, match=f"Not finite: .*{name}"):
+            agent.step(name, loss, {})
+    after = all_state(agent)
+    assert len(before) == len(after) > 4 * len(parameters)
+    assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
+
+
+def test_an_infinite_loss_of_finite_gradient_is_refused():
+    """An infinite reward makes Smooth L1 infinite and its gradient ±1."""
+    s = tiny("maxent")
+    agent, batch = make_agent(s), make_batch(s)
+    row = (~batch["is_first"]).nonzero()[0].tolist()
+    batch["reward"][tuple(row)] = math.inf
+    with pytest.raises(FloatingPointError, match="model"):
+        update(agent, batch, 0.1, s)
+
+
+def test_a_reward_that_is_not_a_number_stops_the_update_before_anything_moves():
+    s = tiny("maxent")
+    agent, batch = make_agent(s), make_batch(s)
+    batch["reward"][:] = math.nan
+    before = all_state(agent)
+    with pytest.raises(FloatingPointError, match="Not finite: model/reward"):
+        update(agent, batch, 0.1, s)
+    assert all(torch.equal(a, b) for a, b in zip(before, all_state(agent), strict=True))

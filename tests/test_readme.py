@@ -1,0 +1,38 @@
+"""The README's table of equations names only what exists."""
+
+import importlib
+import re
+from pathlib import Path
+
+README = (Path(__file__).parent.parent / "README.md").read_text()
+TABLE = README.split("<!-- equations -->")[1].split("<!-- end of equations -->")[0]
+
+
+def names(column: int) -> list[str]:
+    """The names in backquotes in one column of the table."""
+    rows = [line.split("|")[1:-1] for line in TABLE.splitlines() if line.startswith("|")][2:]
+    return [name for row in rows for name in re.findall(r"`([^`]+)`", row[column])]
+
+
+def test_every_function_in_the_table_exists():
+    for name in names(1):
+        file, _, path = name.partition(": ")
+        thing = importlib.import_module(file.removesuffix(".py"))
+        for part in path.split("."):
+            fields = getattr(thing, "__dataclass_fields__", {})
+            assert hasattr(thing, part) or part in fields, name
+            thing = getattr(thing, part, None)
+
+
+def test_every_test_in_the_table_exists():
+    for name in names(2):
+        file, _, test = name.partition(": ")
+        assert f"def {test}(" in (Path(__file__).parent / file).read_text(), name
+
+
+def test_the_table_covers_every_labelled_equation_and_modification():
+    for equation in range(1, 11):
+        assert f"({equation})" in TABLE, equation
+    for modification in ("termination", "rearrangement", "fixed prior", "minor 1", "minor 2"):
+        assert modification in TABLE
+    assert "minor 3" in TABLE and "minor 4" in TABLE

@@ -1,0 +1,257 @@
+"""The whole program, as its user meets it: real PyBullet steps, bad input, kills and faults."""
+
+import csv
+import json
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from train import ARMS, Agent, Settings, main
+
+TRAIN = Path(__file__).parent.parent / "train.py"
+TINY = (
+    "--deter 16 --stoch 8 --hidden 16 --units 16 --depth 2 --mdn-units 16 --horizon 5 "
+    "--batch-size 3 --length 8 --prefill 60 --eval-episodes 2 --random-action 0.5 --free-nats 0"
+).split()
+TIMES = ("wall_seconds", "update_seconds")
+
+
+def command(*arguments) -> list[str]:
+    return [sys.executable, str(TRAIN), *map(str, arguments)]
+
+
+def run(*arguments, **options) -> subprocess.CompletedProcess:
+    """The command line in a process of its own, with one thread."""
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    return subprocess.run(
+        command(*arguments), env=environment, capture_output=True, text=True, timeout=300, **options
+    )
+
+
+def metrics(folder: Path) -> list[dict[str, str]]:
+    """Rows of metrics.csv without what depends on the clock."""
+    with open(folder / "metrics.csv", newline="") as file:
+        return [{k: v for k, v in row.items() if k not in TIMES} for row in csv.DictReader(file)]
+
+
+def one_sentence(text: str) -> bool:
+    return "Traceback" not in text and len(text.strip().splitlines()) == 1
+
+
+# ---- training ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_each_arm_trains_on_pixels_and_moves_every_parameter(arm, tmp_path):
+    folder = tmp_path / "run"
+    done = run("--arm", arm, "--steps", 300, "--eval-every", 150, "--run-dir", folder, *TINY)
+    assert done.returncode == 0, done.stderr
+    rows = metrics(folder)
+    assert [int(row["env_steps"]) // 150 for row in rows] == [1, 2]
+    settings = Settings(**json.loads((folder / "settings.json").read_text()))
+    torch.manual_seed(settings.seed)
+    fresh = Agent(settings, actions=3, device=torch.device("cpu"), bfloat16=False).state_dict()
+    saved = torch.load(folder / "weights.pt", weights_only=True)
+    assert saved.keys() == fresh.keys()
+    assert [name for name in fresh if torch.equal(saved[name], fresh[name])] == []
+    assert ("mdn/entropy" in rows[0]) == settings.entropy
+    assert ("model/termination" in rows[0]) == settings.termination
+
+
+@pytest.mark.parametrize(
+    "env", ["Walker2DBulletEnv-v0", "HalfCheetahBulletEnv-v0", "AntBulletEnv-v0"]
+)
+def test_other_robots_train(env, tmp_path):
+    small = [*TINY, "--eval-episodes", 1]
+    done = run("--env", env, "--steps", 100, "--run-dir", tmp_path / "run", *small)
+    assert done.returncode == 0, done.stderr
+    assert len(metrics(tmp_path / "run")) == 1
+
+
+def test_equal_seeds_give_equal_metrics_and_other_seeds_others(tmp_path):
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        done = run("--steps", 300, "--seed", seed, "--run-dir", tmp_path / name, *TINY)
+        assert done.returncode == 0, done.stderr
+    assert metrics(tmp_path / "a") == metrics(tmp_path / "b")
+    assert metrics(tmp_path / "a") != metrics(tmp_path / "c")
+
+
+# ---- runs that are never lost --------------------------------------------------------------------
+
+LONG = ["--steps", 1200, "--eval-every", 300, "--checkpoint-minutes", 0.002, *TINY]
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "uninterrupted"
+    done = run("--run-dir", folder, *LONG)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def start(*arguments) -> subprocess.Popen:
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        command(*arguments),
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def wait_for_checkpoint(folder: Path, process: subprocess.Popen) -> None:
+    while not (folder / "checkpoint.pt").exists() and process.poll() is None:
+        time.sleep(0.01)
+
+
+def kill_and_resume(folder: Path, kills: int) -> int:
+    """Starts a run, kills it at random moments, resumes it to its end: how often it was killed."""
+    process, killed, delays = start("--run-dir", folder, *LONG), 0, random.Random(0)
+    wait_for_checkpoint(folder, process)
+    while killed < kills:
+        time.sleep(delays.uniform(0, 0.6) + (3 if killed else 0))
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        killed += process.returncode == -signal.SIGKILL
+        process = start("--resume", folder)
+    _, errors = process.communicate()
+    assert process.returncode == 0, errors
+    return killed
+
+
+def test_a_run_killed_and_resumed_equals_one_never_interrupted(uninterrupted, tmp_path):
+    assert kill_and_resume(tmp_path / "run", kills=3) == 3
+    assert metrics(tmp_path / "run") == metrics(uninterrupted)
+
+
+@pytest.mark.slow
+def test_a_run_killed_twenty_times_equals_one_never_interrupted(uninterrupted, tmp_path):
+    assert kill_and_resume(tmp_path / "run", kills=20) == 20
+    assert metrics(tmp_path / "run") == metrics(uninterrupted)
+
+
+def interrupted(folder: Path) -> str:
+    """A run that is ended by Ctrl-C after two checkpoints: what it says."""
+    process = start("--run-dir", folder, *LONG)
+    while not (folder / "checkpoint.previous.pt").exists() and process.poll() is None:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    said, errors = process.communicate()
+    assert process.returncode == 0, errors
+    return said
+
+
+def test_ctrl_c_saves_and_says_how_to_go_on(uninterrupted, tmp_path):
+    folder = tmp_path / "run"
+    assert f"--resume {folder}" in interrupted(folder)
+    assert run("--resume", folder).returncode == 0
+    assert metrics(folder) == metrics(uninterrupted)
+
+
+@pytest.mark.parametrize("damage", ["truncated", "a bit flipped"])
+def test_a_damaged_checkpoint_is_named_and_the_one_before_it_taken(uninterrupted, tmp_path, damage):
+    folder = tmp_path / "run"
+    interrupted(folder)
+    newest = folder / "checkpoint.pt"
+    content = bytearray(newest.read_bytes())
+    content[len(content) // 2] ^= 1
+    newest.write_bytes(content[:1000] if damage == "truncated" else content)
+    resumed = run("--resume", folder)
+    assert resumed.returncode == 0, resumed.stderr
+    assert f"{newest} is damaged" in resumed.stderr
+    assert metrics(folder) == metrics(uninterrupted)
+
+
+def test_a_full_disk_leaves_the_last_checkpoint_and_one_sentence(uninterrupted, tmp_path):
+    """A limit on the size of files stands in for the disk: the replay reaches it first."""
+    folder = tmp_path / "run"
+    limit = 4 * 2**20  # bytes: 340 rows of replay
+
+    def limited() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+
+    full = run("--run-dir", folder, *LONG, preexec_fn=limited)
+    assert full.returncode == 1
+    assert "Traceback" not in full.stderr and f"--resume {folder}" in full.stderr
+    resumed = run("--resume", folder)
+    assert resumed.returncode == 0, resumed.stderr
+    assert metrics(folder) == metrics(uninterrupted)
+
+
+def test_settings_of_another_version_are_named(tmp_path):
+    (tmp_path / "settings.json").write_text(json.dumps({"env": "HopperBulletEnv-v0", "warp": 9}))
+    refused = run("--resume", tmp_path)
+    assert refused.returncode == 2
+    assert one_sentence(refused.stderr) and "warp" in refused.stderr and "gamma" in refused.stderr
+
+
+def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_what_was_learnt(tmp_path):
+    folder = tmp_path / "run"
+    done = run("--steps", 300, "--run-dir", folder, "--model-lr", "1e30", *TINY)
+    assert done.returncode == 1
+    assert "Not finite: model/" in done.stderr and "Traceback" not in done.stderr
+    assert (folder / "checkpoint.pt").exists()
+
+
+# ---- bad input -----------------------------------------------------------------------------------
+
+BAD = {
+    "--env HoperBulletEnv-v0": "HopperBulletEnv-v0",
+    "--env CartPole-v1": "bounded Box",
+    "--env Pendulum-v1": "Pendulum-v1",
+    "--arm maxxent": "dreamer-maxent",
+    "--preset tiny": "paper",
+    "--batchsize 3": "--batch-size",
+    "--batch-size many": "--batch-size",
+    "--batch-size 0": "--batch-size",
+    "--steps -5": "--steps",
+    "--gamma -1": "--gamma",
+    "--gamma nan": "--gamma",
+    "--length 5000": "--prefill",
+    "--replay-capacity 10": "--length",
+    "--device tpu": "cpu",
+    "--resume nowhere": "nowhere",
+    "--precision float8": "float32",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("arguments", BAD)
+def test_bad_input_ends_with_one_sentence_and_code_2_and_nothing_written(
+    arguments, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments.split()) == 2
+    said = capsys.readouterr().err
+    assert one_sentence(said) and BAD[arguments] in said, said
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a CUDA device is here")
+def test_a_device_that_is_not_there_is_refused(capsys):
+    assert main(["--device", "cuda"]) == 2
+    assert one_sentence(capsys.readouterr().err)
+
+
+def test_a_folder_that_holds_a_run_is_never_overwritten(uninterrupted):
+    before = {path: path.stat().st_mtime_ns for path in uninterrupted.iterdir()}
+    refused = run("--run-dir", uninterrupted, *TINY)
+    assert refused.returncode == 2 and one_sentence(refused.stderr)
+    assert {path: path.stat().st_mtime_ns for path in uninterrupted.iterdir()} == before
+
+
+def test_help_explains_every_setting(capsys):
+    with pytest.raises(SystemExit):
+        main(["--arm", "dreamer", "--help"])
+    text = capsys.readouterr().out
+    for name in Settings.__dataclass_fields__:
+        assert f"--{name.replace('_', '-')}" in text
+    assert "stoch INT" in text and "30" in text  # the arm's own value is shown
