@@ -19,11 +19,19 @@ from torch.distributions import Normal
 from returns import lambda_return, survival
 
 
+class Float32Linear(nn.Linear):
+    """A linear layer that autocast leaves alone: in bfloat16's 8 bits a value of 150.3 is 150."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        with torch.autocast(x.device.type, enabled=False):
+            return super().forward(x.float())
+
+
 def mlp(inputs: int, units: int, layers: int, outputs: int) -> nn.Sequential:
     """`layers` hidden ELU layers of `units`, then a linear one, as in Dreamer."""
     sizes = [inputs] + [units] * layers
     hidden = [m for i, o in pairwise(sizes) for m in (nn.Linear(i, o), nn.ELU(inplace=True))]
-    return nn.Sequential(*hidden, nn.Linear(sizes[-1], outputs))
+    return nn.Sequential(*hidden, Float32Linear(sizes[-1], outputs))
 
 
 class StochasticActor(nn.Module):
@@ -40,7 +48,7 @@ class StochasticActor(nn.Module):
 
     def distribution(self, state: Tensor) -> Normal:
         """The distribution before the tanh, in float32: (…, D) -> Normal of (…, A)."""
-        mean, std = self.net(state).float().chunk(2, -1)
+        mean, std = self.net(state).chunk(2, -1)
         return Normal(5 * torch.tanh(mean / 5), F.softplus(std + math.log(math.exp(5) - 1)) + 1e-4)
 
     def forward(self, state: Tensor) -> Tensor:
@@ -61,7 +69,7 @@ class DeterministicActor(nn.Module):
 
     def forward(self, state: Tensor) -> Tensor:
         """The action, in [−1, 1]: (…, D) -> (…, A)."""
-        return torch.tanh(5 * torch.tanh(self.net(state).float() / 5))
+        return torch.tanh(5 * torch.tanh(self.net(state) / 5))
 
     mode = forward
 
@@ -75,7 +83,7 @@ class QCritic(nn.Module):
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """(…, D), (…, A) -> (…). At a ~ π(s): a one-sample estimate of V(s) = E_a Q(s, a)."""
-        return self.net(torch.cat([state, action], -1)).float().squeeze(-1)
+        return self.net(torch.cat([state, action], -1)).squeeze(-1)
 
 
 class VCritic(nn.Module):
@@ -87,7 +95,7 @@ class VCritic(nn.Module):
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """(…, D), (…, A) -> (…). V ignores the action: either critic can stand in the loop."""
-        return self.net(state).float().squeeze(-1)
+        return self.net(state).squeeze(-1)
 
 
 def imagined_returns(dream, critic: nn.Module, gamma: float, lam: float) -> Tensor:

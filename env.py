@@ -42,26 +42,30 @@ def make_env(env_id: str, action_repeat: int = 2, camera_distance: float | None 
             else "see gymnasium.envs.registry for those there are."
         )
         raise ValueError(f"There is no environment {env_id!r}: {hint}") from None
+    env = None
     try:
         env = gym.make(spec, render_mode="rgb_array", disable_env_checker=True)
-        if not isinstance(env.action_space, gym.spaces.Box) or not env.action_space.is_bounded():
-            raise ValueError(f"has actions {env.action_space}: they must be a bounded Box")
+        space = env.action_space
+        if not (isinstance(space, gym.spaces.Box) and space.is_bounded() and len(space.shape) == 1):
+            raise ValueError(f"its actions are {space}, not a bounded Box of one dimension")
+        if hasattr(env.unwrapped, "_render_width"):  # PyBullet: never resized from 320×240
+            env.unwrapped._render_width = env.unwrapped._render_height = IMAGE_SIZE
+            if camera_distance is not None:
+                env.unwrapped._cam_dist = camera_distance
         # PyBullet loads its world at the first reset and restores it at later ones, with other
         # contacts: after this one, an episode is a function of its seed and actions alone, in this
         # process or in one that resumes it.
         env.reset(seed=0)
-        env.render()
+        if not isinstance(env.render(), np.ndarray):
+            raise ValueError("it renders no images")
+        env = wrappers.RecordEpisodeStatistics(env)
+        env = wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
+        env = wrappers.RepeatAction(env, action_repeat)
+        env = wrappers.AddRenderObservation(env)
     except Exception as error:  # whatever a foreign environment raises, a missing library above all
+        if env is not None:
+            env.close()
         raise ValueError(f"{env_id} cannot be learnt from its images: {error}.") from error
-    if hasattr(
-        env.unwrapped, "_render_width"
-    ):  # PyBullet: render at our size, never resize from 320×240
-        env.unwrapped._render_width = env.unwrapped._render_height = IMAGE_SIZE
-        env.unwrapped._cam_dist = camera_distance or env.unwrapped._cam_dist
-    env = wrappers.RecordEpisodeStatistics(env)
-    env = wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
-    env = wrappers.RepeatAction(env, action_repeat)
-    env = wrappers.AddRenderObservation(env)
     if env.observation_space.shape != (IMAGE_SIZE, IMAGE_SIZE, 3):
         space = gym.spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
         env = wrappers.TransformObservation(env, resize, space)
@@ -109,6 +113,15 @@ class Replay:
     def last(self) -> np.void:
         """The newest row."""
         return self.rows[(self.added - 1) % len(self.rows)]
+
+    def parts(self, start: int, stop: int) -> list[np.ndarray]:
+        """Rows start … stop − 1 of all ever added, in order, as one or two views of the ring."""
+        if start == stop:
+            return []
+        first, last = start % len(self.rows), (stop - 1) % len(self.rows) + 1
+        if first < last:
+            return [self.rows[first:last]]
+        return [self.rows[first:], self.rows[:last]]
 
     def sample(self, batch: int, length: int, rng: np.random.Generator) -> np.ndarray:
         """`batch` windows of `length` consecutive rows, each equally likely, as records (B, T).

@@ -75,7 +75,9 @@ class MixtureDensityNetwork(nn.Module):
 
     def forward(self, state: Tensor) -> Mixture:
         """The mixture given each state: (N, D) -> Mixture."""
-        out = self.head(self.hidden(state)).float().unflatten(-1, (self.components, -1))
+        hidden = self.hidden(state)
+        with torch.autocast(state.device.type, enabled=False):  # parameters in float32
+            out = self.head(hidden.float()).unflatten(-1, (self.components, -1))
         log_weights, mean, std = out.split([1, self.size, self.size], -1)
         return Mixture(log_weights.flatten(1).log_softmax(-1), mean, F.softplus(std) + self.min_std)
 

@@ -24,12 +24,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 import torch
 import tyro
+from PIL import Image
 from scipy import stats
 from torch import Tensor, nn
 from torch.utils.tensorboard import SummaryWriter
@@ -278,6 +279,64 @@ def update(agent: Agent, batch: dict[str, Tensor], beta: float, s: Settings) -> 
     return {name: value.item() for name, value in metrics.items()}
 
 
+def train(run: "Run", stop: Callable[[], bool]) -> None:
+    """The algorithm: act, store, update, evaluate, until all steps are made or `stop` says so.
+
+    Raises:
+        FloatingPointError: if a loss or gradient is not finite.
+        OSError: if the disk is full.
+    """
+    s, agent, env, replay = run.s, run.agent, run.env, run.replay
+    saved_at = time.monotonic()
+    while run.step < s.steps and not stop():
+        if run.over:
+            replay.add(run.reset(), is_first=True)
+        if run.step < s.prefill:
+            action = run.rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+        else:
+            last, policy = replay.last, agent.collector(run.episode)
+            action, run.state = act(agent, policy, last["image"], last["action"], run.state)
+            action = explore(action, s.action_noise, s.random_action, run.rng)
+        image, reward, terminated, truncated, info = env.step(action)
+        replay.add(image, action, reward, terminated)
+        before, run.over = run.step, bool(terminated or truncated)
+        run.step = run.begun_at + env.get_wrapper_attr("episode_lengths")
+        if run.over:
+            whole = info["episode"]
+            run.average({"train_return": whole["r"], "train_length": whole["l"]})
+
+        rounds = passed(before, run.step, s.train_every) if run.step >= s.prefill else 0
+        for _ in range(rounds * s.updates):
+            began = time.monotonic()
+            batch = to_tensors(replay.sample(s.batch_size, s.length, run.rng), agent.device)
+            beta = beta_at(run.step, s)
+            run.average(update(agent, batch, beta, s) | {"beta": beta})
+            run.average({"update_seconds": time.monotonic() - began})
+
+        run.bar.update(run.step - run.bar.n)
+        trained = "update_seconds" in run.averages
+        if trained and (run.step >= s.steps or passed(before, run.step, s.eval_every)):
+            run.report(evaluate(agent, run.eval_env, s.eval_episodes))
+        waited = time.monotonic() - saved_at > 60 * s.checkpoint_minutes
+        if waited or replay.added - run.saved_rows >= s.replay_capacity - 1:  # a turn adds up to 2
+            run.save()
+            saved_at = time.monotonic()
+    run.save()
+    weights = io.BytesIO()
+    torch.save(agent.state_dict(), weights)
+    write_whole(run.folder / "weights.pt", weights.getvalue())
+
+
+def passed(before: int, after: int, every: int) -> int:
+    """How many multiples of `every` lie in (before, after]."""
+    return after // every - before // every
+
+
+def to_tensors(rows: np.ndarray, device: torch.device) -> dict[str, Tensor]:
+    """Records of the replay as one tensor a field."""
+    return {name: torch.from_numpy(rows[name]).to(device) for name in rows.dtype.names}
+
+
 def beta_at(step: int, s: Settings) -> float:
     """Entropy coefficient β of Eq. (7), linear in environment steps over the run (§5)."""
     return s.beta_start + (s.beta_end - s.beta_start) * min(step / s.steps, 1.0)
@@ -309,25 +368,62 @@ def act(
         return policy(state)[0].float().cpu().numpy(), state
 
 
-def evaluate(agent: Agent, env: gym.Env, episodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Plays the evaluated actor's mode: returns, and lengths in environment steps, of episodes.
+class Episode(NamedTuple):
+    """An evaluation episode of L decisions."""
 
-    Each episode has a seed of its own, the same ones at each evaluation. The random numbers of
-    training are left as they were.
-    """
-    results = []
+    images: np.ndarray  # (L + 1, 64, 64, 3) uint8 o_0 … o_L
+    actions: np.ndarray  # (L, A) a_0 … a_{L−1}
+    states: Tensor  # (L, D) s_0 … s_{L−1}
+    total: float  # sum of rewards
+    length: int  # environment steps
+
+
+def play(agent: Agent, env: gym.Env, seed: int) -> Episode:
+    """One episode of the evaluated actor's mode. Training's random numbers stay as they were."""
+    image, _ = env.reset(seed=seed)
+    images, actions, states = [image], [np.zeros(env.action_space.shape, np.float32)], [None]
+    over = False
     with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        while not over:
+            action, state = act(agent, agent.evaluated.mode, images[-1], actions[-1], states[-1])
+            image, _, terminated, truncated, info = env.step(action)
+            over = terminated or truncated
+            images.append(image), actions.append(action), states.append(state)
+    images, actions = np.array(images), np.array(actions[1:])
+    return Episode(
+        images, actions, torch.cat(states[1:]), info["episode"]["r"], info["episode"]["l"]
+    )
+
+
+def evaluate(agent: Agent, env: gym.Env, episodes: int) -> list[Episode]:
+    """Episodes of the evaluated actor, each with its own seed, the same ones at each evaluation."""
+    return [play(agent, env, seed=2**31 + episode) for episode in range(episodes)]
+
+
+@torch.no_grad()
+def open_loop(agent: Agent, episode: Episode, frames: int, context: int = 5) -> np.ndarray:
+    """What the model dreams when it sees `context` images and then only the actions taken.
+
+    Training's random numbers stay as they were.
+
+    Returns:
+        (3, F, 64, 64, 3) uint8: truth, prediction (the first `context` are reconstructions), and
+        their difference about grey; F is `frames`, or the episode's length if that is less.
+    """
+    frames = min(frames, len(episode.states))
+    context = min(context, frames)
+    actions = iter(torch.from_numpy(episode.actions[context - 1 :]).to(agent.device).split(1))
+    with agent.autocast(), torch.random.fork_rng():
         torch.manual_seed(0)
-        for episode in range(episodes):
-            image, _ = env.reset(seed=2**31 + episode)
-            action, state, over = np.zeros(env.action_space.shape, np.float32), None, False
-            while not over:
-                action, state = act(agent, agent.evaluated.mode, image, action, state)
-                image, _, terminated, truncated, info = env.step(action)
-                over = terminated or truncated
-            results.append((info["episode"]["r"], info["episode"]["l"]))
-    returns, lengths = np.array(results).T
-    return returns, lengths
+        start = episode.states[context - 1 : context]
+        dream = agent.model.imagine(start, lambda _: next(actions), frames - context)
+        states = torch.cat([episode.states[:context], dream.state[1:, 0]])
+        prediction = agent.model.decoder(agent.model.decoded(states))
+    prediction = (255 * (prediction + 0.5)).clamp(0, 255).byte().cpu().numpy()
+    truth = episode.images[:frames]
+    difference = (128 + (prediction.astype(int) - truth) // 2).astype(np.uint8)
+    return np.stack([truth, prediction, difference])
 
 
 def interval95(returns: np.ndarray) -> float:
@@ -398,34 +494,46 @@ class Run:
         """Take metrics into the averages of the next row of metrics.csv."""
         for name, value in metrics.items():
             total = self.averages.setdefault(name, [0.0, 0])
-            total[0] += value
+            total[0] += float(value)
             total[1] += 1
 
     def elapsed(self) -> float:
         """Seconds that the run has taken, in all its processes."""
         return self.seconds + time.monotonic() - self.clock
 
-    def report(self, returns: np.ndarray, lengths: np.ndarray) -> None:
-        """Write a row of metrics.csv, the same for TensorBoard, a line; begin new averages."""
+    def report(self, episodes: list[Episode]) -> None:
+        """Write a row of metrics.csv, the same and pictures for TensorBoard, and a line."""
+        returns, lengths = (
+            np.array([getattr(e, k) for e in episodes]) for k in ("total", "length")
+        )
         row = {
             "env_steps": self.step,
             "wall_seconds": self.elapsed(),
             "eval_return": returns.mean(),
             "eval_interval95": interval95(returns),
             "eval_length": lengths.mean(),
+            "eval_length_min": lengths.min(),
+            "eval_length_max": lengths.max(),
             "train_return": float("nan"),  # unless an episode ended
             "train_length": float("nan"),
-            "beta": beta_at(self.step, self.s),
         } | {name: total / count for name, (total, count) in self.averages.items()}
         self.averages.clear()
         with open(self.folder / "metrics.csv", "a", newline="") as file:
             table = csv.DictWriter(file, row)
             if file.tell() == 0:
                 table.writeheader()
-            table.writerow({name: f"{value:.6g}" for name, value in row.items()})
+            table.writerow({
+                name: value if isinstance(value, int) else f"{value:.6g}"
+                for name, value in row.items()
+            })  # fmt: skip
             self.metrics_bytes = file.tell()
         for name, value in row.items():
             self.writer.add_scalar(name, value, self.step)
+        whole = len(episodes[0].states)
+        seen = open_loop(self.agent, episodes[0], whole, context=whole)
+        dreamt = open_loop(self.agent, episodes[0], frames=25)
+        self.add_picture("episode, reconstruction, difference", seen)
+        self.add_picture("episode, dream from its first 5 images, difference", dreamt)
         self.writer.flush()
         result = f"return {returns.mean():.1f} ± {row['eval_interval95']:.1f}"
         self.bar.set_postfix_str(result)
@@ -434,18 +542,27 @@ class Run:
             f"{lengths.mean():.0f} steps an episode"
         )
 
+    def add_picture(self, name: str, images: np.ndarray) -> None:
+        """(R, F, 64, 64, 3) for TensorBoard: R rows of ten of the F images."""
+        some = images[:, np.linspace(0, images.shape[1] - 1, 10).astype(int)]
+        picture = np.concatenate([np.concatenate(list(row), axis=1) for row in some])
+        self.writer.add_image(name, picture, self.step, dataformats="HWC")
+
     def save(self) -> None:
         """Write a checkpoint, whole or not at all; the one before it is kept.
 
         Raises:
             OSError: if it cannot be written, as on a full disk; the last one is then as it was.
         """
-        rows, added = self.replay.rows, self.replay.added
+        added = self.replay.added
         self.seconds, self.clock = self.elapsed(), time.monotonic()
         with open(self.folder / "replay.bin", "ab") as file:
-            file.truncate(self.saved_rows * rows.itemsize)
-            file.write(rows[np.arange(self.saved_rows, added) % len(rows)].tobytes())
+            file.truncate(self.saved_rows * self.replay.rows.itemsize)
+            for part in self.replay.parts(self.saved_rows, added):
+                file.write(part.view(np.uint8))
             file.flush()
+            os.fsync(file.fileno())
+        with open(self.folder / "metrics.csv", "ab") as file:
             os.fsync(file.fileno())
         self.saved_rows = added
         buffer = io.BytesIO()
@@ -461,69 +578,101 @@ class Run:
         }, buffer)  # fmt: skip
         content = buffer.getvalue()
         newest, previous = (self.folder / name for name in self.CHECKPOINTS)
-        aside = self.folder / "checkpoint.writing"
-        with open(aside, "wb") as file:
-            file.write(hashlib.sha256(content).digest() + content)
-            file.flush()
-            os.fsync(file.fileno())
         if newest.exists():
             newest.replace(previous)
-        aside.replace(newest)
+        write_whole(newest, hashlib.sha256(content).digest() + content)
 
     def load(self) -> None:
-        """Go back to the newest whole checkpoint.
+        """Go back to the newest whole checkpoint, or to the start if there was none yet.
 
         Raises:
-            ValueError: in one sentence, if there is none, or the machine is another.
+            ValueError: in one sentence, if the folder is damaged, or the machine is another.
         """
-        saved = self.read_checkpoint()
+        self.set_back(self.read_checkpoint())
+        size = (self.folder / "metrics.csv").stat().st_size
+        if size < self.metrics_bytes:
+            raise ValueError(f"{self.folder / 'metrics.csv'} has lost rows: start the run anew.")
+        os.truncate(self.folder / "metrics.csv", self.metrics_bytes)
+        self.load_replay()
+
+    def set_back(self, saved: dict | None) -> None:
+        """Become what a checkpoint holds; None, from before the first, is what a new run is."""
+        if saved is None:
+            return
         self.agent.load_state_dict(saved["agent"])
         for name, optimiser in self.agent.optimisers.items():
             optimiser.load_state_dict(saved["optimisers"][name])
         for name in self.COUNTERS:
             setattr(self, name, saved["counters"][name])
-        self.averages = saved["averages"]
+        self.averages, self.state = saved["averages"], saved["state"]
         torch.set_rng_state(saved["torch_random"].cpu())
         torch.cuda.set_rng_state_all([state.cpu() for state in saved["cuda_random"]])
         self.rng.bit_generator.state = json.loads(saved["numpy_random"])
-        os.truncate(self.folder / "metrics.csv", self.metrics_bytes)
-        self.load_replay()
-        self.state = saved["state"]
 
-    def read_checkpoint(self) -> dict:
-        """The newest whole checkpoint of the folder. Nothing in it is executed."""
-        for path in (self.folder / name for name in self.CHECKPOINTS):
-            content = path.read_bytes() if path.exists() else b""
+    def read_checkpoint(self) -> dict | None:
+        """The newest whole checkpoint, None before the first. Nothing in it is executed.
+
+        Raises:
+            ValueError: in one sentence, if none is whole.
+        """
+        paths = [self.folder / name for name in self.CHECKPOINTS]
+        paths = [path for path in paths if path.exists()]
+        for path in paths:
+            content = path.read_bytes()
             digest, content = content[:32], content[32:]
-            if content and hashlib.sha256(content).digest() == digest:
+            if hashlib.sha256(content).digest() == digest:
                 return torch.load(
                     io.BytesIO(content), map_location=self.agent.device, weights_only=True
                 )
-            if path.exists():
-                print(f"{path} is damaged; taking the checkpoint before it.", file=sys.stderr)
-        raise ValueError(f"{self.folder} holds no whole checkpoint: start the run anew.")
+            path.replace(path.with_suffix(".damaged"))  # never to be kept in a good one's place
+            print(f"{path} is damaged; looking for the one before it.", file=sys.stderr)
+        if paths:
+            raise ValueError(f"{self.folder} holds no whole checkpoint: start the run anew.")
+        return None
 
     def load_replay(self) -> None:
-        """The replay from its file, and the episode under way by taking its actions again."""
-        rows, added = self.replay.rows, self.saved_rows
-        kept = np.arange(max(0, added - len(rows)), added)
-        path = self.folder / "replay.bin"
-        if path.stat().st_size < added * rows.itemsize:
+        """The replay from its file, and the episode under way by taking its actions again.
+
+        Raises:
+            ValueError: in one sentence, if the file is too short or the episode differs.
+        """
+        replay, added = self.replay, self.saved_rows
+        path, itemsize = self.folder / "replay.bin", replay.rows.itemsize
+        if added == 0:
+            return
+        if not path.exists() or path.stat().st_size < added * itemsize:
             raise ValueError(f"{path} is shorter than its checkpoint says: start the run anew.")
+        kept = max(0, added - len(replay.rows))
         with open(path, "rb") as file:
-            file.seek(kept[0] * rows.itemsize)
-            rows[kept % len(rows)] = np.fromfile(file, rows.dtype, len(kept))
-        self.replay.added = added
+            file.seek(kept * itemsize)
+            for part in replay.parts(kept, added):
+                file.readinto(part.view(np.uint8))
+        replay.added = added
         if self.over:
             return
-        first = kept[rows["is_first"][kept % len(rows)]][-1]
-        self.episode -= 1
+        stored = np.memmap(path, replay.rows.dtype, "r", shape=added)
+        first = np.flatnonzero(stored["is_first"])[-1]
+        state, self.episode = self.state, self.episode - 1
         image = self.reset()
-        for index in range(first + 1, added):
-            image = self.env.step(rows["action"][index % len(rows)])[0]
-        self.begun_at = self.step - self.env.get_wrapper_attr("episode_lengths")
-        if not np.array_equal(image, self.replay.last["image"]):
+        for action in np.array(stored["action"][first + 1 :]):
+            image = self.env.step(action)[0]
+        self.state, self.begun_at = state, self.step - self.env.get_wrapper_attr("episode_lengths")
+        if not np.array_equal(image, replay.last["image"]):
             raise ValueError("The episode under way did not come back: was the run made elsewhere?")
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all: aside, onto the disk, then in its place.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    aside = path.with_suffix(".writing")
+    with open(aside, "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    aside.replace(path)
 
 
 def has_bfloat16(device: torch.device) -> bool:
@@ -534,60 +683,6 @@ def has_bfloat16(device: torch.device) -> bool:
     return any(capabilities.get(name, False) for name in ("avx512_bf16", "amx_bf16", "bf16"))
 
 
-def train(run: Run, stop: Callable[[], bool]) -> None:
-    """The algorithm: act, store, update, evaluate, until all steps are made or `stop` says so.
-
-    Raises:
-        FloatingPointError: if a loss or gradient is not finite.
-        OSError: if the disk is full.
-    """
-    s, agent, env, replay = run.s, run.agent, run.env, run.replay
-    saved_at = time.monotonic()
-    while run.step < s.steps and not stop():
-        if run.over:
-            replay.add(run.reset(), is_first=True)
-        if run.step < s.prefill:
-            action = run.rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
-        else:
-            last, policy = replay.last, agent.collector(run.episode)
-            action, run.state = act(agent, policy, last["image"], last["action"], run.state)
-            action = explore(action, s.action_noise, s.random_action, run.rng)
-        image, reward, terminated, truncated, info = env.step(action)
-        replay.add(image, action, reward, terminated)
-        before, run.over = run.step, terminated or truncated
-        run.step = run.begun_at + env.get_wrapper_attr("episode_lengths")
-        if run.over:
-            run.average({f"train_{k}": info["episode"][k[0]] for k in ("return", "length")})
-
-        rounds = passed(before, run.step, s.train_every) if run.step >= s.prefill else 0
-        for _ in range(rounds * s.updates):
-            began = time.monotonic()
-            batch = to_tensors(replay.sample(s.batch_size, s.length, run.rng), agent.device)
-            run.average(update(agent, batch, beta_at(run.step, s), s))
-            run.average({"update_seconds": time.monotonic() - began})
-
-        run.bar.update(run.step - run.bar.n)
-        trained = "update_seconds" in run.averages
-        if trained and (run.step >= s.steps or passed(before, run.step, s.eval_every)):
-            run.report(*evaluate(agent, run.eval_env, s.eval_episodes))
-        waited = time.monotonic() - saved_at > 60 * s.checkpoint_minutes
-        if waited or replay.added - run.saved_rows >= s.replay_capacity:
-            run.save()
-            saved_at = time.monotonic()
-    run.save()
-    torch.save(agent.state_dict(), run.folder / "weights.pt")
-
-
-def passed(before: int, after: int, every: int) -> int:
-    """How many multiples of `every` lie in (before, after]."""
-    return after // every - before // every
-
-
-def to_tensors(rows: np.ndarray, device: torch.device) -> dict[str, Tensor]:
-    """Records of the replay as one tensor a field."""
-    return {name: torch.from_numpy(rows[name]).to(device) for name in rows.dtype.names}
-
-
 @dataclass(frozen=True)
 class Command:
     """MaxEnt Dreamer learns to act from 64×64 pixels, in a world that it imagines.
@@ -596,7 +691,12 @@ class Command:
     """
 
     settings: tyro.conf.OmitArgPrefixes[Settings]
-    resume: str = ""  # folder of a run to go on with; its settings hold, no other option goes along
+    resume: str | None = None  # folder of a run to go on with, by its own settings
+    evaluate: str | None = (
+        None  # folder of a run whose newest checkpoint to evaluate, by its own settings
+    )
+    episodes: int = 10  # to evaluate
+    video: bool = False  # with --evaluate: an animated GIF of an episode beside its dream
 
 
 def parse(arguments: list[str]) -> Command:
@@ -610,6 +710,8 @@ def parse(arguments: list[str]) -> Command:
     first.add_argument("--preset", nargs="?", default="small")
     chosen = first.parse_known_args(arguments)[0]
     for name, value, known in (("arm", chosen.arm, ARMS), ("preset", chosen.preset, PRESETS)):
+        if value is None:
+            raise ValueError(f"--{name} lacks its value: choose one of {', '.join(known)}.")
         if value not in known:
             raise ValueError(f"There is no {name} {value!r}: choose one of {', '.join(known)}.")
     default = Command(default_settings(chosen.arm, chosen.preset))
@@ -634,12 +736,16 @@ def check(s: Settings) -> None:
     Raises:
         ValueError: in one sentence, what is wrong and what to do.
     """
+    shares = ("gamma", "lam", "gamma_q", "random_action", "target_rate")
     for field in dataclasses.fields(s):
         value, option = getattr(s, field.name), f"--{field.name.replace('_', '-')}"
-        if type(value) is int and value < (field.name not in ("seed", "prefill")):
-            raise ValueError(f"{option} is {value}: give a whole number above it.")
-        if type(value) is float and not value >= 0:
-            raise ValueError(f"{option} is {value}: give 0 or more.")
+        least = 0 if field.name in ("seed", "prefill") else 1
+        if type(value) is int and not least <= value < 2**63:
+            raise ValueError(f"{option} is {value}: give a whole number of {least} or more.")
+        if type(value) is float and not 0 <= value < float("inf"):
+            raise ValueError(f"{option} is {value}: give a number of 0 or more.")
+        if field.name in shares and value > 1:
+            raise ValueError(f"{option} is {value}: give a number from 0 to 1.")
     rows = s.prefill // s.action_repeat
     if s.length > rows:
         raise ValueError(
@@ -648,24 +754,23 @@ def check(s: Settings) -> None:
         )
     if s.length > s.replay_capacity:
         raise ValueError(f"--replay-capacity {s.replay_capacity} holds no --length {s.length}.")
+    if s.steps < s.prefill + s.train_every:
+        raise ValueError(
+            f"--steps {s.steps} leaves nothing to train after --prefill {s.prefill}: raise it to "
+            f"{s.prefill + s.train_every} or more."
+        )
     if s.device not in ("auto", "cpu", "cuda"):
         raise ValueError(f"There is no --device {s.device}: choose one of auto, cpu, cuda.")
     if s.device == "cuda" and not torch.cuda.is_available():
         raise ValueError("--device cuda: no CUDA device is there; leave it out to use the CPU.")
 
 
-def open_run(command: Command) -> Run:
-    """A new run in a folder of its own, or one taken up again.
+def new_run(s: Settings) -> Run:
+    """A new run, in a folder of its own.
 
     Raises:
-        ValueError: in one sentence, what is wrong with the command.
+        ValueError: in one sentence, what is wrong with the settings.
     """
-    s = command.settings
-    if command.resume:
-        folder = Path(command.resume)
-        run = Run(read_settings(folder), folder)
-        run.load()
-        return run
     check(s)
     now = time.strftime("%Y%m%d-%H%M%S")
     folder = Path(s.run_dir or f"runs/{s.env}-{s.arm}-{s.preset}-seed{s.seed}-{now}")
@@ -673,8 +778,9 @@ def open_run(command: Command) -> Run:
         raise ValueError(f"{folder} is there already: name another --run-dir, or --resume it.")
     run = Run(s, folder)
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "settings.json").write_text(json.dumps(dataclasses.asdict(s), indent=2) + "\n")
     (folder / "metrics.csv").touch()
+    settings = json.dumps(dataclasses.asdict(s), indent=2) + "\n"
+    write_whole(folder / "settings.json", settings.encode())
     return run
 
 
@@ -687,12 +793,16 @@ def read_settings(folder: Path) -> Settings:
     path = folder / "settings.json"
     if not path.exists():
         raise ValueError(f"{folder} holds no run: there is no settings.json in it.")
-    saved = json.loads(path.read_text())
+    try:
+        saved = dict(json.loads(path.read_text()))
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path} cannot be read: {error}.") from error
     differing = saved.keys() ^ {field.name for field in dataclasses.fields(Settings)}
     if differing:
         names = ", ".join(sorted(differing))
         raise ValueError(f"{folder} was made by a version with other settings: {names}.")
-    return Settings(**saved)
+    check(settings := Settings(**saved))
+    return settings
 
 
 def keep_freed_memory() -> None:
@@ -710,13 +820,66 @@ def main(arguments: list[str]) -> int:
     """Runs a command line. Returns the exit code: 0 done, 1 stopped by a fault, 2 bad input."""
     keep_freed_memory()
     try:
-        run = open_run(parse(arguments))
-    except ValueError as error:
+        command = parse(arguments)
+        own = command.resume is not None or command.evaluate is not None
+        if own and command.settings != default_settings():
+            raise ValueError("--resume and --evaluate go by the run's settings: give no others.")
+        if command.resume is not None and command.evaluate is not None:
+            raise ValueError("Give --resume or --evaluate, not both.")
+        if command.evaluate is not None:
+            evaluate_run(Path(command.evaluate), command.episodes, command.video)
+            return 0
+        if command.video or command.episodes != 10:
+            raise ValueError("--video and --episodes go with --evaluate.")
+        if command.resume is not None:
+            folder = Path(command.resume)
+            run = Run(read_settings(folder), folder)
+            run.load()
+        else:
+            run = new_run(command.settings)
+    except (ValueError, OSError, MemoryError) as error:
         print(error, file=sys.stderr)
         return 2
     print(run.describe(), flush=True)
+    return train_run(run)
+
+
+def evaluate_run(folder: Path, episodes: int, video: bool) -> None:
+    """Plays the newest checkpoint of a run and prints what it earned.
+
+    Raises:
+        ValueError: in one sentence, if there is nothing to play.
+    """
+    if episodes < 1:
+        raise ValueError(f"--episodes is {episodes}: give 1 or more.")
+    run = Run(read_settings(folder), folder)
+    run.set_back(run.read_checkpoint())
+    played = evaluate(run.agent, run.eval_env, episodes)
+    returns, lengths = np.array([e.total for e in played]), np.array([e.length for e in played])
+    print(
+        f"{run.s.env}, arm {run.s.arm}, after {run.step:,} environment steps: "
+        f"return {returns.mean():.1f} ± {interval95(returns):.1f} (95% interval of {episodes} "
+        f"episodes), {lengths.min()} to {lengths.max()} steps long, {lengths.mean():.0f} on average"
+    )
+    if video:
+        best = played[returns.argmax()]
+        frames = np.concatenate(open_loop(run.agent, best, frames=150), axis=2)  # side by side
+        pictures = [Image.fromarray(frame).resize((576, 192)) for frame in frames]
+        path = folder / f"episode-{run.step}.gif"
+        duration = 1000 * run.s.action_repeat / 60  # milliseconds: PyBullet renders 60 a second
+        pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=duration, loop=0)
+        print(f"{path}: truth, dream from its first 5 images and the actions taken, difference")
+
+
+def train_run(run: Run) -> int:
+    """Trains to the end, to Ctrl-C or to a fault, and says what to do next: the exit code."""
     interrupted = threading.Event()
-    signal.signal(signal.SIGINT, lambda *_: interrupted.set())
+
+    def interrupt(*_) -> None:
+        run.bar.write("Finishing what is under way, then saving; Ctrl-C again to stop at once.")
+        interrupted.set()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
     resume = f"Go on with: python train.py --resume {run.folder}"
     every = 0.5 if sys.stderr.isatty() else 30  # seconds between two lines of a log file
     try:
@@ -724,15 +887,17 @@ def main(arguments: list[str]) -> int:
             tqdm(total=run.s.steps, initial=run.step, unit="step", mininterval=every) as run.bar,
             SummaryWriter(run.folder, purge_step=run.step + 1) as run.writer,
         ):
-            train(run, interrupted.is_set)
-    except FloatingPointError as error:
-        run.save()
-        print(
-            f"{error} What was learned before is saved in {run.folder}; "
-            "try a lower --model-lr, --actor-lr or --critic-lr, or --precision float32.",
-            file=sys.stderr,
-        )
-        return 1
+            signal.signal(signal.SIGINT, interrupt)
+            try:
+                train(run, interrupted.is_set)
+            except FloatingPointError as error:
+                run.save()
+                print(
+                    f"{error} What was learned before is saved in {run.folder}; "
+                    "try a lower --model-lr, --actor-lr or --critic-lr, or --precision float32.",
+                    file=sys.stderr,
+                )
+                return 1
     except OSError as error:
         print(f"{error}: stopped; the last checkpoint is whole. {resume}", file=sys.stderr)
         return 1
@@ -742,4 +907,7 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except KeyboardInterrupt:
+        sys.exit("Stopped at once; what the last checkpoint holds can be resumed.")

@@ -117,15 +117,23 @@ def centre(image: Tensor) -> Tensor:
 
 def normal(statistics: Tensor) -> Normal:
     """(…, 2·stoch) to a diagonal Gaussian of (…, stoch), float32, std softplus + 0.1 (Dreamer)."""
-    mean, std = statistics.float().chunk(2, -1)
+    mean, std = statistics.chunk(2, -1)
     return Normal(mean, F.softplus(std) + 0.1, validate_args=False)
+
+
+class Float32Linear(nn.Linear):
+    """A linear layer that autocast leaves alone: in bfloat16's 8 bits a value of 150.3 is 150."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        with torch.autocast(x.device.type, enabled=False):
+            return super().forward(x.float())
 
 
 def mlp(inputs: int, units: int, layers: int, outputs: int) -> nn.Sequential:
     """`layers` hidden ELU layers of `units`, then a linear one, as in Dreamer."""
     sizes = [inputs] + [units] * layers
     hidden = [m for i, o in pairwise(sizes) for m in (nn.Linear(i, o), nn.ELU(inplace=True))]
-    return nn.Sequential(*hidden, nn.Linear(sizes[-1], outputs))
+    return nn.Sequential(*hidden, Float32Linear(sizes[-1], outputs))
 
 
 class WorldModel(nn.Module):
@@ -168,17 +176,15 @@ class WorldModel(nn.Module):
         self.fixed_prior, self.smooth_l1, self.free_nats = fixed_prior, smooth_l1, free_nats
         self.decode_stoch_only, self.observe_first = decode_stoch_only, observe_first
         self.encoder = Encoder(depth)
-        self.dense_stoch = nn.Linear(
-            stoch, hidden, bias=False
-        )  # with the next: one dense layer on (z, a), whose
-        self.dense_action = nn.Linear(actions, hidden)  # second half needs no recurrence
+        # One dense layer on (z, a), in two parts: the action's needs no recurrence.
+        self.dense_stoch = nn.Linear(stoch, hidden, bias=False)
+        self.dense_action = nn.Linear(actions, hidden)
         self.gru = nn.GRUCell(hidden, deter)
         self.prior_net = mlp(deter, hidden, 1, 2 * stoch)
-        self.posterior_deter = nn.Linear(
-            deter, hidden, bias=False
-        )  # likewise one dense layer on (h, embedding)
+        # Likewise one dense layer on (h, embedding).
+        self.posterior_deter = nn.Linear(deter, hidden, bias=False)
         self.posterior_embed = nn.Linear(self.encoder.size, hidden)
-        self.posterior_out = nn.Linear(hidden, 2 * stoch)
+        self.posterior_out = Float32Linear(hidden, 2 * stoch)
         self.decoder = Decoder(stoch if decode_stoch_only else self.size, depth)
         self.reward = mlp(self.size, units, 2, 1)
         self.termination = mlp(self.size, units, 3, 1) if termination else None
@@ -200,9 +206,8 @@ class WorldModel(nn.Module):
         """
         length = image.shape[1]
         embedding = self.encoder(image.flatten(0, 1)).unflatten(0, image.shape[:2])
-        embed_share = self.posterior_embed(
-            embedding
-        )  # (B, T, hidden), as is all that follows outside the loop
+        # (B, T, hidden) each: what needs no recurrence is computed for all steps at once
+        embed_share = self.posterior_embed(embedding)
         action_share = self.dense_action(action)
         noise = torch.randn(*image.shape[:2], self.stoch, device=image.device)
         going_on = (~is_first).float().unsqueeze(-1)
@@ -255,13 +260,13 @@ class WorldModel(nn.Module):
 
     def predict_reward(self, state: Tensor) -> Tensor:
         """r(s): (…, D) -> (…), the reward for achieving the state."""
-        return self.reward(state).float().squeeze(-1)
+        return self.reward(state).squeeze(-1)
 
     def predict_continues(self, state: Tensor) -> Tensor:
         """c(s) = 1 − d(s), the probability that the episode goes on: (…, D) -> (…)."""
         if self.termination is None:
             return torch.ones(state.shape[:-1], device=state.device)
-        return torch.sigmoid(-self.termination(state).float()).squeeze(-1)
+        return torch.sigmoid(-self.termination(state)).squeeze(-1)
 
     def decoded(self, state: Tensor) -> Tensor:
         """What the decoder sees of a state: z alone (§4.2, minor 3), or (h, z)."""
@@ -293,7 +298,7 @@ class WorldModel(nn.Module):
         image = self.decoder.nll(
             self.decoded(observed.state).flatten(0, 1), batch["image"].flatten(0, 1)
         )
-        predicted = self.reward(observed.state).float().squeeze(-1)
+        predicted = self.reward(observed.state).squeeze(-1)
         reward_loss = (
             F.smooth_l1_loss if self.smooth_l1 else lambda *a, **k: 0.5 * F.mse_loss(*a, **k)
         )
@@ -304,7 +309,7 @@ class WorldModel(nn.Module):
             ),
         }
         if self.termination is not None:
-            logit = self.termination(observed.state).float().squeeze(-1)
+            logit = self.termination(observed.state).squeeze(-1)
             bce = F.binary_cross_entropy_with_logits(
                 logit, batch["terminated"].float(), reduction="none"
             )

@@ -5,6 +5,7 @@ import json
 import os
 import random
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
 from train import ARMS, Agent, Settings, main
 
@@ -86,7 +88,7 @@ def test_equal_seeds_give_equal_metrics_and_other_seeds_others(tmp_path):
 
 # ---- runs that are never lost --------------------------------------------------------------------
 
-LONG = ["--steps", 1200, "--eval-every", 300, "--checkpoint-minutes", 0.002, *TINY]
+LONG = ["--steps", 600, "--eval-every", 200, "--checkpoint-minutes", 0.002, *TINY]
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +176,7 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_it_taken(uninterrupted
 def test_a_full_disk_leaves_the_last_checkpoint_and_one_sentence(uninterrupted, tmp_path):
     """A limit on the size of files stands in for the disk: the replay reaches it first."""
     folder = tmp_path / "run"
-    limit = 4 * 2**20  # bytes: 340 rows of replay
+    limit = 2 * 2**20  # bytes: 170 rows of replay
 
     def limited() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
@@ -202,6 +204,16 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_what_was_learnt(tmp_p
     assert (folder / "checkpoint.pt").exists()
 
 
+def test_any_run_can_be_evaluated_and_filmed(uninterrupted, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(uninterrupted, folder)
+    done = run("--evaluate", folder, "--episodes", 2, "--video")
+    assert done.returncode == 0, done.stderr
+    assert f"return {float(metrics(folder)[-1]['eval_return']):.1f} " in done.stdout
+    with Image.open(folder / "episode-600.gif") as film:
+        assert film.size == (3 * 192, 192) and film.n_frames > 1
+
+
 # ---- bad input -----------------------------------------------------------------------------------
 
 BAD = {
@@ -220,6 +232,9 @@ BAD = {
     "--replay-capacity 10": "--length",
     "--device tpu": "cpu",
     "--resume nowhere": "nowhere",
+    "--resume nowhere --steps 7": "settings: give no others",
+    "--evaluate nowhere": "nowhere",
+    "--evaluate nowhere --episodes 0": "nowhere",
     "--precision float8": "float32",
 }  # fmt: skip
 
