@@ -49,7 +49,8 @@ class StochasticActor(nn.Module):
     def distribution(self, state: Tensor) -> Normal:
         """The distribution before the tanh, in float32: (…, D) -> Normal of (…, A)."""
         mean, std = self.net(state).chunk(2, -1)
-        return Normal(5 * torch.tanh(mean / 5), F.softplus(std + math.log(math.exp(5) - 1)) + 1e-4)
+        std = F.softplus(std + math.log(math.exp(5) - 1)) + 1e-4
+        return Normal(5 * torch.tanh(mean / 5), std, validate_args=False)
 
     def forward(self, state: Tensor) -> Tensor:
         """A reparametrised sample of π(· | s), in [−1, 1]: (…, D) -> (…, A)."""
