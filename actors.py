@@ -135,6 +135,15 @@ def critic_loss(critic: nn.Module, dream, returns: Tensor, smooth_l1: bool) -> T
     return (survival(dream.continues) * error).mean()
 
 
+def nudge(action: Tensor, std: float) -> Tensor:
+    """An action with a little reparametrised noise: the first of the deterministic actor's dream.
+
+    Without it Q would only ever be fitted at a = A(s), and its slope ∂Q/∂a there be chance. A
+    departure: the paper has no such noise.
+    """
+    return (action + std * torch.randn_like(action)).clamp(-1, 1)
+
+
 def explore(
     action: np.ndarray, noise: float, random_probability: float, rng: np.random.Generator
 ) -> np.ndarray:

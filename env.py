@@ -32,16 +32,7 @@ def make_env(env_id: str, action_repeat: int = 2, camera_distance: float | None 
     Raises:
         ValueError: in one sentence, what is wrong with `env_id` and what to do.
     """
-    try:
-        spec = gym.spec(env_id)
-    except gym.error.Error:
-        close = difflib.get_close_matches(env_id, gym.registry, n=3, cutoff=0.5)
-        hint = (
-            f"did you mean {' or '.join(close)}?"
-            if close
-            else "see gymnasium.envs.registry for those there are."
-        )
-        raise ValueError(f"There is no environment {env_id!r}: {hint}") from None
+    spec = find_spec(env_id)
     env = None
     try:
         env = gym.make(spec, render_mode="rgb_array", disable_env_checker=True)
@@ -70,6 +61,24 @@ def make_env(env_id: str, action_repeat: int = 2, camera_distance: float | None 
         space = gym.spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
         env = wrappers.TransformObservation(env, resize, space)
     return env
+
+
+def find_spec(env_id: str) -> gym.envs.registration.EnvSpec:
+    """The registered environment of that name.
+
+    Raises:
+        ValueError: in one sentence, with those of a similar name.
+    """
+    try:
+        return gym.spec(env_id)
+    except gym.error.Error:
+        close = difflib.get_close_matches(env_id, gym.registry, n=3, cutoff=0.5)
+        hint = (
+            f"did you mean {' or '.join(close)}?"
+            if close
+            else "gymnasium.pprint_registry() lists all."
+        )
+        raise ValueError(f"There is no environment {env_id!r}: {hint}") from None
 
 
 def resize(image: np.ndarray) -> np.ndarray:

@@ -45,6 +45,7 @@ from actors import (
     critic_loss,
     explore,
     imagined_returns,
+    nudge,
 )
 from env import Replay, make_env
 from mdn import MixtureDensityNetwork, entropy, mdn_loss, soft_update
@@ -73,7 +74,7 @@ class Settings:
     prefill: int = 5000  # environment steps of uniformly random actions before training (Dreamer)
     train_every: int = 10  # environment steps between two rounds of updates (Dreamer: 1000)
     updates: int = 1  # gradient updates a round (Dreamer: 100)
-    eval_every: int = 10_000  # environment steps between two evaluations (ours)
+    eval_every: int = 10_000  # environment steps between evaluations, once training began (ours)
     eval_episodes: int = 10  # episodes an evaluation (§5: 10)
     checkpoint_minutes: float = 5.0  # between two checkpoints (ours)
     replay_capacity: int = 500_000  # rows (decisions) of experience kept (ours)
@@ -118,7 +119,9 @@ class Settings:
     mdn_lr: float = 2e-4  # of the mixture density network (§5)
     grad_clip: float = 100.0  # largest global gradient norm of an optimiser step (Dreamer)
     free_nats: float = 3.0  # KL below this costs nothing; of `kl` only (Dreamer)
-    reward_weight: float = 1.0  # weight of the reward's loss (Dreamer)
+    image_weight: float = 1.0  # weight of the image's loss (Dreamer)
+    reward_weight: float = 1.0  # of the reward's loss (Dreamer)
+    termination_weight: float = 1.0  # of the termination's loss (ours)
     kl_weight: float = 1.0  # of `kl`, the original Dreamer's divergence (Dreamer)
     kl_standard_weight: float = 0.1  # of KL(posterior || N(0, 1)) (§5)
     jeffreys_weight: float = 0.1  # of D_J(posterior || prior) (§5)
@@ -238,11 +241,7 @@ def update(agent: Agent, batch: dict[str, Tensor], beta: float, s: Settings) -> 
     """
     with agent.autocast():
         terms, states = agent.model.loss(batch)
-        weight = {
-            "image": 1.0, "termination": 1.0, "reward": s.reward_weight, "kl": s.kl_weight,
-            "kl_standard": s.kl_standard_weight, "jeffreys": s.jeffreys_weight,
-        }  # fmt: skip
-        loss = sum(weight[name] * term for name, term in terms.items())
+        loss = sum(getattr(s, f"{name}_weight") * term for name, term in terms.items())
     metrics = {f"model/{name}": term for name, term in terms.items()}
     agent.step("model", loss, metrics)
 
@@ -251,9 +250,8 @@ def update(agent: Agent, batch: dict[str, Tensor], beta: float, s: Settings) -> 
         explorer = name == "stochastic" and s.entropy
         with agent.autocast():
             first = actor(starts)
-            if name == "deterministic":  # else Q is only asked at a = A(s), ∂Q/∂a would be chance
-                noise = s.first_action_noise * torch.randn_like(first)
-                first = (first + noise).clamp(-1, 1)
+            if name == "deterministic":
+                first = nudge(first, s.first_action_noise)
             dream = agent.model.imagine(starts, actor, s.horizon, first)
             returns = imagined_returns(dream, agent.critics[name], s.gamma, s.lam)
             loss = actor_loss(returns, dream.continues, s.first_state_only)
@@ -287,7 +285,6 @@ def train(run: "Run", stop: Callable[[], bool]) -> None:
         OSError: if the disk is full.
     """
     s, agent, env, replay = run.s, run.agent, run.env, run.replay
-    saved_at = time.monotonic()
     while run.step < s.steps and not stop():
         if run.over:
             replay.add(run.reset(), is_first=True)
@@ -317,14 +314,8 @@ def train(run: "Run", stop: Callable[[], bool]) -> None:
         trained = "update_seconds" in run.averages
         if trained and (run.step >= s.steps or passed(before, run.step, s.eval_every)):
             run.report(evaluate(agent, run.eval_env, s.eval_episodes))
-        waited = time.monotonic() - saved_at > 60 * s.checkpoint_minutes
-        if waited or replay.added - run.saved_rows >= s.replay_capacity - 1:  # a turn adds up to 2
-            run.save()
-            saved_at = time.monotonic()
+        run.save_if_due()
     run.save()
-    weights = io.BytesIO()
-    torch.save(agent.state_dict(), weights)
-    write_whole(run.folder / "weights.pt", weights.getvalue())
 
 
 def passed(before: int, after: int, every: int) -> int:
@@ -548,6 +539,13 @@ class Run:
         picture = np.concatenate([np.concatenate(list(row), axis=1) for row in some])
         self.writer.add_image(name, picture, self.step, dataformats="HWC")
 
+    def save_if_due(self) -> None:
+        """Write a checkpoint every `checkpoint_minutes`, and before the ring loses new rows."""
+        waited = time.monotonic() - self.clock >= 60 * self.s.checkpoint_minutes
+        unsaved = self.replay.added - self.saved_rows
+        if waited or unsaved >= self.s.replay_capacity - 1:  # a turn of the loop adds up to two
+            self.save()
+
     def save(self) -> None:
         """Write a checkpoint, whole or not at all; the one before it is kept.
 
@@ -581,6 +579,12 @@ class Run:
         if newest.exists():
             newest.replace(previous)
         write_whole(newest, hashlib.sha256(content).digest() + content)
+
+    def save_weights(self) -> None:
+        """Write weights.pt: the networks alone, for whoever wants to use them elsewhere."""
+        weights = io.BytesIO()
+        torch.save(self.agent.state_dict(), weights)
+        write_whole(self.folder / "weights.pt", weights.getvalue())
 
     def load(self) -> None:
         """Go back to the newest whole checkpoint, or to the start if there was none yet.
@@ -759,6 +763,8 @@ def check(s: Settings) -> None:
             f"--steps {s.steps} leaves nothing to train after --prefill {s.prefill}: raise it to "
             f"{s.prefill + s.train_every} or more."
         )
+    if s.eval_every < s.train_every:
+        raise ValueError(f"--eval-every {s.eval_every} is less than --train-every {s.train_every}.")
     if s.device not in ("auto", "cpu", "cuda"):
         raise ValueError(f"There is no --device {s.device}: choose one of auto, cpu, cuda.")
     if s.device == "cuda" and not torch.cuda.is_available():
@@ -890,6 +896,8 @@ def train_run(run: Run) -> int:
             signal.signal(signal.SIGINT, interrupt)
             try:
                 train(run, interrupted.is_set)
+                if run.step >= run.s.steps:
+                    run.save_weights()
             except FloatingPointError as error:
                 run.save()
                 print(
@@ -901,8 +909,10 @@ def train_run(run: Run) -> int:
     except OSError as error:
         print(f"{error}: stopped; the last checkpoint is whole. {resume}", file=sys.stderr)
         return 1
-    done = run.step >= run.s.steps
-    print(f"Done: {run.folder / 'metrics.csv'}" if done else f"Interrupted. {resume}")
+    if run.step < run.s.steps:
+        print(f"Interrupted. {resume}")
+    else:
+        print(f"Done: {run.folder / 'metrics.csv'}")
     return 0
 
 
