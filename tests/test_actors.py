@@ -259,3 +259,13 @@ def test_random_actions_are_uniform_and_as_frequent_as_asked():
     assert stats.kstest(got, stats.uniform(-1, 2).cdf).pvalue > 0.001
     count = sum(explore(np.zeros(2), 0.0, 0.3, rng).any() for _ in range(5000))
     assert stats.binomtest(int(count), 5000, 0.3).pvalue > 0.001
+
+
+@pytest.mark.parametrize("critic", [QCritic(6, 2, 8), VCritic(6, 8)])
+def test_values_keep_their_digits_in_bfloat16(critic):
+    """bfloat16 would make 150 of 150.3: the last layer is in float32 whatever the others are."""
+    torch.nn.init.zeros_(critic.net[-1].weight)
+    torch.nn.init.constant_(critic.net[-1].bias, 150.3)
+    with torch.autocast("cpu", torch.bfloat16):
+        value = critic(torch.randn(5, 6), torch.randn(5, 2))
+    torch.testing.assert_close(value, torch.full((5,), 150.3))

@@ -448,3 +448,13 @@ def test_bfloat16_terms_are_within_two_percent_of_float32(fixed_prior):
     for name, term in rounded.items():
         assert term.dtype == torch.float32, name
         assert term.item() == pytest.approx(exact[name].item(), rel=0.02), name
+
+
+def test_rewards_keep_their_digits_in_bfloat16():
+    """bfloat16 would make 150 of 150.3: the last layer is in float32 whatever the others are."""
+    model = make_model()
+    nn.init.zeros_(model.reward[-1].weight)
+    nn.init.constant_(model.reward[-1].bias, 150.3)
+    with torch.autocast("cpu", torch.bfloat16):
+        reward = model.predict_reward(torch.randn(5, model.size))
+    torch.testing.assert_close(reward, torch.full((5,), 150.3))
