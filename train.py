@@ -285,34 +285,26 @@ def train(run: "Run", stop: Callable[[], bool]) -> None:
         OSError: if the disk is full.
     """
     s, agent, env, replay = run.s, run.agent, run.env, run.replay
-    while run.step < s.steps and not stop():
-        if run.over:
-            replay.add(run.reset(), is_first=True)
-        if run.step < s.prefill:
-            action = run.rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+    while not run.finished and not stop():
+        if run.owed == 0:
+            if run.over:
+                replay.add(run.reset(), is_first=True)
+            if run.step < s.prefill:
+                action = run.rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+            else:
+                last, policy = replay.last, agent.collector(run.episode)
+                action, run.state = act(agent, policy, last["image"], last["action"], run.state)
+                action = explore(action, s.action_noise, s.random_action, run.rng)
+            image, reward, terminated, truncated, info = env.step(action)
+            replay.add(image, action, reward, terminated)
+            run.advance(bool(terminated or truncated), info)
         else:
-            last, policy = replay.last, agent.collector(run.episode)
-            action, run.state = act(agent, policy, last["image"], last["action"], run.state)
-            action = explore(action, s.action_noise, s.random_action, run.rng)
-        image, reward, terminated, truncated, info = env.step(action)
-        replay.add(image, action, reward, terminated)
-        before, run.over = run.step, bool(terminated or truncated)
-        run.step = run.begun_at + env.get_wrapper_attr("episode_lengths")
-        if run.over:
-            whole = info["episode"]
-            run.average({"train_return": whole["r"], "train_length": whole["l"]})
-
-        rounds = passed(before, run.step, s.train_every) if run.step >= s.prefill else 0
-        for _ in range(rounds * s.updates):
-            began = time.monotonic()
+            began, beta = time.monotonic(), beta_at(run.step, s)
             batch = to_tensors(replay.sample(s.batch_size, s.length, run.rng), agent.device)
-            beta = beta_at(run.step, s)
             run.average(update(agent, batch, beta, s) | {"beta": beta})
             run.average({"update_seconds": time.monotonic() - began})
-
-        run.bar.update(run.step - run.bar.n)
-        trained = "update_seconds" in run.averages
-        if trained and (run.step >= s.steps or passed(before, run.step, s.eval_every)):
+            run.owed -= 1
+        if run.evaluation_due and run.owed == 0:
             run.report(evaluate(agent, run.eval_env, s.eval_episodes))
         run.save_if_due()
     run.save()
@@ -434,7 +426,10 @@ class Run:
     """
 
     CHECKPOINTS = ("checkpoint.pt", "checkpoint.previous.pt")
-    COUNTERS = ("step", "episode", "over", "seconds", "saved_rows", "metrics_bytes")
+    COUNTERS = (
+        "step", "episode", "over", "owed", "evaluation_due", "seconds", "saved_rows",
+        "metrics_bytes",
+    )  # fmt: skip
 
     def __init__(self, s: Settings, folder: Path):
         self.s, self.folder = s, folder
@@ -457,6 +452,8 @@ class Run:
         self.episode = 0  # episodes begun
         self.over = True  # whether the last of them has ended
         self.begun_at = 0  # step at which it began
+        self.owed = 0  # updates still to be made before the next decision
+        self.evaluation_due = False  # when they are made
         self.saved_rows = 0  # rows in replay.bin
         self.metrics_bytes = 0  # length of metrics.csv
         self.seconds, self.clock = 0.0, time.monotonic()  # taken until then; then
@@ -481,6 +478,25 @@ class Run:
         self.begun_at, self.state = self.step, None
         return self.env.reset(seed=int(seed))[0]
 
+    @property
+    def finished(self) -> bool:
+        """Whether all environment steps are made, and the updates that they call for."""
+        return self.step >= self.s.steps and self.owed == 0
+
+    def advance(self, over: bool, info: dict) -> None:
+        """Count a decision that was taken, and what it calls for: updates, an evaluation."""
+        s, before, self.over = self.s, self.step, over
+        self.step = self.begun_at + self.env.get_wrapper_attr("episode_lengths")
+        if over:
+            whole = info["episode"]
+            self.average({"train_return": whole["r"], "train_length": whole["l"]})
+        if self.step >= s.prefill:
+            self.owed = s.updates * passed(before, self.step, s.train_every)
+        last = self.step >= s.steps
+        trained = self.owed > 0 or "update_seconds" in self.averages
+        self.evaluation_due = trained and (last or passed(before, self.step, s.eval_every) > 0)
+        self.bar.update(self.step - self.bar.n)
+
     def average(self, metrics: dict[str, float]) -> None:
         """Take metrics into the averages of the next row of metrics.csv."""
         for name, value in metrics.items():
@@ -494,6 +510,7 @@ class Run:
 
     def report(self, episodes: list[Episode]) -> None:
         """Write a row of metrics.csv, the same and pictures for TensorBoard, and a line."""
+        self.evaluation_due = False
         returns, lengths = (
             np.array([getattr(e, k) for e in episodes]) for k in ("total", "length")
         )
@@ -576,9 +593,7 @@ class Run:
         }, buffer)  # fmt: skip
         content = buffer.getvalue()
         newest, previous = (self.folder / name for name in self.CHECKPOINTS)
-        if newest.exists():
-            newest.replace(previous)
-        write_whole(newest, hashlib.sha256(content).digest() + content)
+        write_whole(newest, hashlib.sha256(content).digest() + content, keep=previous)
 
     def save_weights(self) -> None:
         """Write weights.pt: the networks alone, for whoever wants to use them elsewhere."""
@@ -592,11 +607,12 @@ class Run:
         Raises:
             ValueError: in one sentence, if the folder is damaged, or the machine is another.
         """
-        self.set_back(self.read_checkpoint())
-        size = (self.folder / "metrics.csv").stat().st_size
-        if size < self.metrics_bytes:
-            raise ValueError(f"{self.folder / 'metrics.csv'} has lost rows: start the run anew.")
-        os.truncate(self.folder / "metrics.csv", self.metrics_bytes)
+        self.set_back(self.read_checkpoint(discard=True))
+        metrics = self.folder / "metrics.csv"
+        metrics.touch()
+        if metrics.stat().st_size < self.metrics_bytes:
+            raise ValueError(f"{metrics} has lost rows: start the run anew.")
+        os.truncate(metrics, self.metrics_bytes)
         self.load_replay()
 
     def set_back(self, saved: dict | None) -> None:
@@ -613,22 +629,26 @@ class Run:
         torch.cuda.set_rng_state_all([state.cpu() for state in saved["cuda_random"]])
         self.rng.bit_generator.state = json.loads(saved["numpy_random"])
 
-    def read_checkpoint(self) -> dict | None:
+    def read_checkpoint(self, discard: bool = False) -> dict | None:
         """The newest whole checkpoint, None before the first. Nothing in it is executed.
+
+        Args:
+            discard: remove a damaged one that is newer, lest it take the whole one's place.
 
         Raises:
             ValueError: in one sentence, if none is whole.
         """
         paths = [self.folder / name for name in self.CHECKPOINTS]
         paths = [path for path in paths if path.exists()]
-        for path in paths:
+        for k, path in enumerate(paths):
             content = path.read_bytes()
             digest, content = content[:32], content[32:]
             if hashlib.sha256(content).digest() == digest:
+                for damaged in paths[:k] if discard else []:
+                    damaged.unlink()
                 return torch.load(
                     io.BytesIO(content), map_location=self.agent.device, weights_only=True
                 )
-            path.replace(path.with_suffix(".damaged"))  # never to be kept in a good one's place
             print(f"{path} is damaged; looking for the one before it.", file=sys.stderr)
         if paths:
             raise ValueError(f"{self.folder} holds no whole checkpoint: start the run anew.")
@@ -638,7 +658,7 @@ class Run:
         """The replay from its file, and the episode under way by taking its actions again.
 
         Raises:
-            ValueError: in one sentence, if the file is too short or the episode differs.
+            ValueError: in one sentence, if the file is too short.
         """
         replay, added = self.replay, self.saved_rows
         path, itemsize = self.folder / "replay.bin", replay.rows.itemsize
@@ -662,11 +682,18 @@ class Run:
             image = self.env.step(action)[0]
         self.state, self.begun_at = state, self.step - self.env.get_wrapper_attr("episode_lengths")
         if not np.array_equal(image, replay.last["image"]):
-            raise ValueError("The episode under way did not come back: was the run made elsewhere?")
+            print(
+                f"{self.s.env} does not repeat itself: the episode under way ends here, and the "
+                "run goes on otherwise than it would have.",
+                file=sys.stderr,
+            )
+            self.over = True
 
 
-def write_whole(path: Path, content: bytes) -> None:
+def write_whole(path: Path, content: bytes, keep: Path | None = None) -> None:
     """Write a file whole or not at all: aside, onto the disk, then in its place.
+
+    What stood in its place is kept as `keep`, if that is given.
 
     Raises:
         OSError: if it cannot be written.
@@ -676,6 +703,8 @@ def write_whole(path: Path, content: bytes) -> None:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
+    if keep and path.exists():
+        path.replace(keep)
     aside.replace(path)
 
 
@@ -756,7 +785,7 @@ def check(s: Settings) -> None:
             f"--length {s.length} is longer than the {rows} rows that --prefill {s.prefill} "
             "collects: lower the one or raise the other."
         )
-    if s.length > s.replay_capacity:
+    if s.length > s.replay_capacity or s.replay_capacity < 2:
         raise ValueError(f"--replay-capacity {s.replay_capacity} holds no --length {s.length}.")
     if s.steps < s.prefill + s.train_every:
         raise ValueError(
@@ -784,7 +813,6 @@ def new_run(s: Settings) -> Run:
         raise ValueError(f"{folder} is there already: name another --run-dir, or --resume it.")
     run = Run(s, folder)
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "metrics.csv").touch()
     settings = json.dumps(dataclasses.asdict(s), indent=2) + "\n"
     write_whole(folder / "settings.json", settings.encode())
     return run
@@ -846,6 +874,9 @@ def main(arguments: list[str]) -> int:
     except (ValueError, OSError, MemoryError) as error:
         print(error, file=sys.stderr)
         return 2
+    except RuntimeError as error:  # torch's, for sizes that no memory holds or weights that differ
+        print(f"The networks cannot be made: {str(error).splitlines()[0]}", file=sys.stderr)
+        return 2
     print(run.describe(), flush=True)
     return train_run(run)
 
@@ -859,7 +890,9 @@ def evaluate_run(folder: Path, episodes: int, video: bool) -> None:
     if episodes < 1:
         raise ValueError(f"--episodes is {episodes}: give 1 or more.")
     run = Run(read_settings(folder), folder)
-    run.set_back(run.read_checkpoint())
+    if not (saved := run.read_checkpoint()):
+        raise ValueError(f"{folder} holds no checkpoint yet: there is nothing to play.")
+    run.set_back(saved)
     played = evaluate(run.agent, run.eval_env, episodes)
     returns, lengths = np.array([e.total for e in played]), np.array([e.length for e in played])
     print(
@@ -894,9 +927,11 @@ def train_run(run: Run) -> int:
             SummaryWriter(run.folder, purge_step=run.step + 1) as run.writer,
         ):
             signal.signal(signal.SIGINT, interrupt)
+            # TensorBoard's thread meets a full disk too; what it raises there comes back here
+            threading.excepthook = lambda _: None
             try:
                 train(run, interrupted.is_set)
-                if run.step >= run.s.steps:
+                if run.finished:
                     run.save_weights()
             except FloatingPointError as error:
                 run.save()
@@ -907,12 +942,9 @@ def train_run(run: Run) -> int:
                 )
                 return 1
     except OSError as error:
-        print(f"{error}: stopped; the last checkpoint is whole. {resume}", file=sys.stderr)
+        print(f"{error}: stopped; what was saved before is whole. {resume}", file=sys.stderr)
         return 1
-    if run.step < run.s.steps:
-        print(f"Interrupted. {resume}")
-    else:
-        print(f"Done: {run.folder / 'metrics.csv'}")
+    print(f"Done: {run.folder / 'metrics.csv'}" if run.finished else f"Interrupted. {resume}")
     return 0
 
 

@@ -36,3 +36,7 @@ def test_the_table_covers_every_labelled_equation_and_modification():
     for modification in ("termination", "rearrangement", "fixed prior", "minor 1", "minor 2"):
         assert modification in TABLE
     assert "minor 3" in TABLE and "minor 4" in TABLE
+
+
+def test_nothing_is_left_to_be_filled_in():
+    assert "@@" not in README

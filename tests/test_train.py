@@ -120,6 +120,14 @@ def wait_for(path: Path, process: subprocess.Popen) -> None:
         time.sleep(0.01)
 
 
+def written(folder: Path) -> int:
+    """When the newest checkpoint was written; 0 if there is none."""
+    try:
+        return (folder / "checkpoint.pt").stat().st_mtime_ns
+    except FileNotFoundError:
+        return 0
+
+
 def kill_and_resume(folder: Path, kills: int) -> int:
     """Starts a run and kills it, first before and then after its first checkpoint, at random
     moments; resumes it to its end: how often it was killed."""
@@ -129,10 +137,12 @@ def kill_and_resume(folder: Path, kills: int) -> int:
         process.send_signal(signal.SIGKILL)
         process.communicate()
         killed += process.returncode == -signal.SIGKILL
+        before = written(folder)
         process = start("--resume", folder)
-        wait_for(folder / "checkpoint.pt", process)
-        if killed > 1:  # the checkpoint is there before the process is: give it time to move on
-            time.sleep(delays.uniform(2, 5))
+        while written(folder) == before and process.poll() is None:
+            time.sleep(0.01)
+        time.sleep(delays.uniform(0, 0.5))
+        assert not (folder / "weights.pt").exists(), "it ended before it was killed often enough"
     _, errors = process.communicate()
     assert process.returncode == 0, errors
     return killed
@@ -178,6 +188,31 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_it_taken(uninterrupted
     assert resumed.returncode == 0, resumed.stderr
     assert f"{newest} is damaged" in resumed.stderr
     assert metrics(folder) == metrics(uninterrupted)
+
+
+def test_a_run_without_a_whole_checkpoint_is_refused_and_left_as_it_is(tmp_path):
+    folder = tmp_path / "run"
+    interrupted(folder)
+    for name in ("checkpoint.pt", "checkpoint.previous.pt"):
+        (folder / name).write_bytes(b"damaged")
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    for _ in range(2):
+        assert main(["--resume", str(folder)]) == 2
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_a_run_whose_replay_has_wrapped_around_can_be_resumed(tmp_path):
+    ring = ["--steps", 400, "--eval-every", 200, "--replay-capacity", 20, *TINY]
+    assert run("--run-dir", tmp_path / "whole", *ring).returncode == 0
+    folder = tmp_path / "run"
+    process = start("--run-dir", folder, *ring)
+    while (folder / "replay.bin").stat().st_size < 2**20 if written(folder) else True:
+        time.sleep(0.01)  # 85 rows, more than four times round
+        assert process.poll() is None
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert run("--resume", folder).returncode == 0
+    assert metrics(folder) == metrics(tmp_path / "whole")
 
 
 def test_a_full_disk_leaves_the_last_checkpoint_and_one_sentence(uninterrupted, tmp_path):
