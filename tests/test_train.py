@@ -128,10 +128,10 @@ def written(folder: Path) -> int:
         return 0
 
 
-def kill_and_resume(folder: Path, kills: int) -> int:
+def kill_and_resume(folder: Path, kills: int, arguments: list) -> int:
     """Starts a run and kills it, first before and then after its first checkpoint, at random
     moments; resumes it to its end: how often it was killed."""
-    process, killed, delays = start("--run-dir", folder, *LONG), 0, random.Random(0)
+    process, killed, delays = start("--run-dir", folder, *arguments), 0, random.Random(0)
     wait_for(folder / "settings.json", process)
     while killed < kills:
         process.send_signal(signal.SIGKILL)
@@ -149,14 +149,16 @@ def kill_and_resume(folder: Path, kills: int) -> int:
 
 
 def test_a_run_killed_and_resumed_equals_one_never_interrupted(uninterrupted, tmp_path):
-    assert kill_and_resume(tmp_path / "run", kills=3) == 3
+    assert kill_and_resume(tmp_path / "run", 3, LONG) == 3
     assert metrics(tmp_path / "run") == metrics(uninterrupted)
 
 
 @pytest.mark.slow
-def test_a_run_killed_twenty_times_equals_one_never_interrupted(uninterrupted, tmp_path):
-    assert kill_and_resume(tmp_path / "run", kills=20) == 20
-    assert metrics(tmp_path / "run") == metrics(uninterrupted)
+def test_a_run_killed_twenty_times_equals_one_never_interrupted(tmp_path):
+    longer = [*LONG, "--steps", 3000]
+    assert run("--run-dir", tmp_path / "whole", *longer).returncode == 0
+    assert kill_and_resume(tmp_path / "run", 20, longer) == 20
+    assert metrics(tmp_path / "run") == metrics(tmp_path / "whole")
 
 
 def interrupted(folder: Path) -> str:
