@@ -910,6 +910,12 @@ def evaluate_run(folder: Path, episodes: int, video: bool) -> None:
         print(f"{path}: truth, dream from its first 5 images and the actions taken, difference")
 
 
+def leave_out_os_errors(thrown: threading.ExceptHookArgs) -> None:
+    """No traceback of TensorBoard's thread on a full disk: its error comes back in ours."""
+    if not isinstance(thrown.exc_value, OSError):
+        threading.__excepthook__(thrown)
+
+
 def train_run(run: Run) -> int:
     """Trains to the end, to Ctrl-C or to a fault, and says what to do next: the exit code."""
     interrupted = threading.Event()
@@ -927,8 +933,7 @@ def train_run(run: Run) -> int:
             SummaryWriter(run.folder, purge_step=run.step + 1) as run.writer,
         ):
             signal.signal(signal.SIGINT, interrupt)
-            # TensorBoard's thread meets a full disk too; what it raises there comes back here
-            threading.excepthook = lambda _: None
+            threading.excepthook = leave_out_os_errors
             try:
                 train(run, interrupted.is_set)
                 if run.finished:

@@ -233,6 +233,18 @@ def test_a_full_disk_leaves_the_last_checkpoint_and_one_sentence(uninterrupted, 
     assert metrics(folder) == metrics(uninterrupted)
 
 
+def test_a_disk_that_is_full_for_tensorboard_first_is_one_sentence_too(tmp_path):
+    limit = 40_000  # bytes: less than the first pictures
+
+    def limited() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+
+    late = [*LONG, "--checkpoint-minutes", 99]
+    full = run("--run-dir", tmp_path / "run", *late, preexec_fn=limited)
+    assert full.returncode == 1
+    assert "Traceback" not in full.stderr and "--resume" in full.stderr, full.stderr
+
+
 def test_settings_of_another_version_are_named(tmp_path):
     (tmp_path / "settings.json").write_text(json.dumps({"env": "HopperBulletEnv-v0", "warp": 9}))
     refused = run("--resume", tmp_path)
