@@ -1,4 +1,5 @@
-"""Experience: environments seen through their pixels, and the replay buffer of what was seen.
+"""Experience: environments seen through their pixels, the replay buffer of what was seen, and
+how much of the environment's own states that covers.
 
 The observation is the rendered 64×64 image and nothing else (§5). Rows of experience are
 arrival-indexed: an observation stands beside the action that led to it and the reward and
@@ -12,6 +13,8 @@ import numpy as np
 import pybullet_envs_gymnasium  # noqa: F401, registers the PyBullet environments
 from gymnasium import wrappers
 from PIL import Image
+from scipy.spatial import KDTree
+from scipy.special import digamma, gammaln
 
 IMAGE_SIZE = 64
 
@@ -20,8 +23,9 @@ def make_env(env_id: str, action_repeat: int = 2, camera_distance: float | None 
     """An environment whose observation is its 64×64×3 uint8 image and whose actions lie in [−1, 1].
 
     Each action is repeated, its rewards summed, up to the end of the episode; `terminated` and
-    `truncated` stay apart. The last step's info["episode"] holds return "r" and length "l" in
-    environment steps.
+    `truncated` stay apart. A step's info["state"] is the environment's own observation, which the
+    agent never sees; the last step's info["episode"] holds return "r" and length "l" in environment
+    steps.
 
     Args:
         env_id: any registered environment with bounded `Box` actions that renders `rgb_array`.
@@ -50,6 +54,7 @@ def make_env(env_id: str, action_repeat: int = 2, camera_distance: float | None 
         if not isinstance(env.render(), np.ndarray):
             raise ValueError("it renders no images")
         env = wrappers.RecordEpisodeStatistics(env)
+        env = StateInInfo(env)
         env = wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
         env = wrappers.RepeatAction(env, action_repeat)
         env = wrappers.AddRenderObservation(env)
@@ -84,6 +89,41 @@ def find_spec(env_id: str) -> gym.envs.registration.EnvSpec:
 def resize(image: np.ndarray) -> np.ndarray:
     """Any image to 64×64 by averaging."""
     return np.asarray(Image.fromarray(image).resize((IMAGE_SIZE, IMAGE_SIZE), Image.Resampling.BOX))
+
+
+class StateInInfo(gym.Wrapper):
+    """Keeps the environment's own observation in `info`, for `coverage`."""
+
+    def step(self, action):
+        state, reward, terminated, truncated, info = self.env.step(action)
+        return state, reward, terminated, truncated, info | {"state": np.ravel(state)}
+
+
+def coverage(states: np.ndarray, k: int = 3) -> float:
+    """Entropy of the distribution that visited states are samples of: exploration, measured.
+
+    The Kozachenko-Leonenko (particle) estimate from the distance ε_i of each state to its k-th
+    nearest neighbour, V the volume of the unit ball of d dimensions, ψ the digamma function:
+
+        ψ(n) − ψ(k) + log V + d/n Σ_i log ε_i
+
+    It is consistent, but biased where n is small for d, so compare only equal n. ε is taken as
+    1e-6 at least: states that repeat exactly have no density.
+
+    Args:
+        states: (n, d), in the environment's own units.
+        k: neighbours; more have less variance and more bias.
+
+    Returns:
+        nats; nan for fewer than k + 1 states.
+    """
+    n, d = states.shape
+    if n <= k:
+        return float("nan")
+    distance = KDTree(states).query(states, k + 1)[0][:, k]  # the nearest is the state itself
+    log_ball = d / 2 * np.log(np.pi) - gammaln(d / 2 + 1)
+    spread = d * np.log(np.maximum(distance, 1e-6)).mean()
+    return float(digamma(n) - digamma(k) + log_ball + spread)
 
 
 class Replay:

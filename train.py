@@ -47,7 +47,7 @@ from actors import (
     imagined_returns,
     nudge,
 )
-from env import Replay, make_env
+from env import Replay, coverage, make_env
 from mdn import MixtureDensityNetwork, entropy, mdn_loss, soft_update
 from world_model import WorldModel
 
@@ -346,9 +346,9 @@ def act(
     """
     rows = np.array(image), np.array(action), np.array(state is None)  # B = T = 1
     rows = [torch.from_numpy(x)[None, None].to(agent.device) for x in rows]
-    with agent.autocast():
-        state = agent.model.observe(*rows, previous=state).state[:, 0]
-        return policy(state)[0].float().cpu().numpy(), state
+    # In float32: to cast all weights costs more than one image's products in bfloat16 save.
+    state = agent.model.observe(*rows, previous=state).state[:, 0]
+    return policy(state)[0].cpu().numpy(), state
 
 
 class Episode(NamedTuple):
@@ -448,6 +448,7 @@ class Run:
         self.replay = Replay(s.replay_capacity, actions)
         self.state: Tensor | None = None  # (1, D), the agent's; None: it has not looked yet
         self.averages: dict[str, list[float]] = {}  # name: [sum, count] since the last evaluation
+        self.visited: list[Tensor] = []  # the environment's own states since then
         self.step = 0  # environment steps made
         self.episode = 0  # episodes begun
         self.over = True  # whether the last of them has ended
@@ -486,6 +487,7 @@ class Run:
     def advance(self, over: bool, info: dict) -> None:
         """Count a decision that was taken, and what it calls for: updates, an evaluation."""
         s, before, self.over = self.s, self.step, over
+        self.visited.append(torch.from_numpy(info["state"]))
         self.step = self.begun_at + self.env.get_wrapper_attr("episode_lengths")
         if over:
             whole = info["episode"]
@@ -522,10 +524,11 @@ class Run:
             "eval_length": lengths.mean(),
             "eval_length_min": lengths.min(),
             "eval_length_max": lengths.max(),
+            "coverage": coverage(torch.stack(self.visited).numpy()),
             "train_return": float("nan"),  # unless an episode ended
             "train_length": float("nan"),
         } | {name: total / count for name, (total, count) in self.averages.items()}
-        self.averages.clear()
+        self.averages.clear(), self.visited.clear()
         with open(self.folder / "metrics.csv", "a", newline="") as file:
             table = csv.DictWriter(file, row)
             if file.tell() == 0:
@@ -586,6 +589,7 @@ class Run:
             "optimisers": {name: o.state_dict() for name, o in self.agent.optimisers.items()},
             "counters": {name: getattr(self, name) for name in self.COUNTERS},
             "averages": self.averages,
+            "visited": torch.stack(self.visited) if self.visited else torch.zeros(0),
             "state": self.state,
             "torch_random": torch.get_rng_state(),
             "cuda_random": torch.cuda.get_rng_state_all(),
@@ -625,6 +629,7 @@ class Run:
         for name in self.COUNTERS:
             setattr(self, name, saved["counters"][name])
         self.averages, self.state = saved["averages"], saved["state"]
+        self.visited = list(saved["visited"].cpu())
         torch.set_rng_state(saved["torch_random"].cpu())
         torch.cuda.set_rng_state_all([state.cpu() for state in saved["cuda_random"]])
         self.rng.bit_generator.state = json.loads(saved["numpy_random"])

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from env import Replay, make_env, resize
+from env import Replay, coverage, make_env, resize
 
 IDS = [f"{robot}BulletEnv-v0" for robot in ("Hopper", "Walker2D", "HalfCheetah", "Ant")]
 
@@ -288,3 +288,30 @@ def test_replay_shorter_than_a_window_is_refused():
     assert replay.sample(1, 4, np.random.default_rng(0))["reward"].tolist() == [[0, 1, 2, 3]]
     with pytest.raises(ValueError, match="holds 4 rows"):
         replay.sample(1, 5, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("d", [1, 2, 5])
+def test_coverage_is_a_gaussians_entropy(d):
+    rng = np.random.default_rng(0)
+    std = np.linspace(0.5, 2, d)
+    exact = stats.multivariate_normal(cov=np.diag(std**2)).entropy()
+    estimates = [coverage(std * rng.standard_normal((4000, d))) for _ in range(5)]
+    assert np.mean(estimates) == pytest.approx(exact, abs=0.1)
+
+
+def test_coverage_grows_by_the_log_of_the_scale():
+    states = np.random.default_rng(0).standard_normal((500, 3))
+    assert coverage(2 * states + 7) == pytest.approx(coverage(states) + 3 * np.log(2))
+
+
+def test_coverage_of_repeated_states_is_finite_and_of_too_few_nan():
+    assert np.isfinite(coverage(np.zeros((10, 3))))
+    assert np.isnan(coverage(np.zeros((3, 3))))
+
+
+def test_the_environments_own_state_is_in_info_and_not_in_the_observation(make):
+    env = make("HopperBulletEnv-v0")
+    image, _ = env.reset(seed=0)
+    _, _, _, _, info = env.step(np.zeros(3, np.float32))
+    assert image.shape == (64, 64, 3)
+    assert np.array_equal(info["state"], env.unwrapped.robot.calc_state())
