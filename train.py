@@ -352,36 +352,39 @@ def act(
 
 
 class Episode(NamedTuple):
-    """An evaluation episode of L decisions."""
+    """An episode of L decisions, played without learning from it."""
 
     images: np.ndarray  # (L + 1, 64, 64, 3) uint8 o_0 … o_L
     actions: np.ndarray  # (L, A) a_0 … a_{L−1}
+    rewards: np.ndarray  # (L,) r_1 … r_L
     states: Tensor  # (L, D) s_0 … s_{L−1}
+    terminated: bool  # or cut off by a time limit
     total: float  # sum of rewards
     length: int  # environment steps
 
 
-def play(agent: Agent, env: gym.Env, seed: int) -> Episode:
-    """One episode of the evaluated actor's mode. Training's random numbers stay as they were."""
+def play(agent: Agent, env: gym.Env, policy: Callable[[Tensor], Tensor], seed: int) -> Episode:
+    """One episode of a policy. Training's random numbers stay as they were."""
     image, _ = env.reset(seed=seed)
     images, actions, states = [image], [np.zeros(env.action_space.shape, np.float32)], [None]
-    over = False
+    rewards, over = [], False
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         while not over:
-            action, state = act(agent, agent.evaluated.mode, images[-1], actions[-1], states[-1])
-            image, _, terminated, truncated, info = env.step(action)
+            action, state = act(agent, policy, images[-1], actions[-1], states[-1])
+            image, reward, terminated, truncated, info = env.step(action)
             over = terminated or truncated
             images.append(image), actions.append(action), states.append(state)
-    images, actions = np.array(images), np.array(actions[1:])
+            rewards.append(reward)
     return Episode(
-        images, actions, torch.cat(states[1:]), info["episode"]["r"], info["episode"]["l"]
-    )
+        np.array(images), np.array(actions[1:]), np.array(rewards), torch.cat(states[1:]),
+        bool(terminated), info["episode"]["r"], info["episode"]["l"],
+    )  # fmt: skip
 
 
 def evaluate(agent: Agent, env: gym.Env, episodes: int) -> list[Episode]:
-    """Episodes of the evaluated actor, each with its own seed, the same ones at each evaluation."""
-    return [play(agent, env, seed=2**31 + episode) for episode in range(episodes)]
+    """Episodes of the evaluated actor's mode, each with a seed of its own, always the same ones."""
+    return [play(agent, env, agent.evaluated.mode, seed=2**31 + k) for k in range(episodes)]
 
 
 @torch.no_grad()

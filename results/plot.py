@@ -1,14 +1,16 @@
-"""The figure and the table of all runs in this folder, from their files alone.
+"""The figure and the table of all runs in a folder, from their files alone.
 
-    python -m results.plot
+    python results/plot.py [FOLDER]
 
-draws results/curves.png, one panel an environment, one line an arm: the mean over seeds and its 95%
-t-interval, each seed as a thin line; above, returns of evaluation; below, how much of the
-environment's own state space the collected rows cover. Writes results/table.md.
+draws FOLDER/curves.png (results/ if none is given), one column of panels an environment, one line
+an arm: the mean over seeds and its 95% t-interval, each seed as a thin line; above, returns of
+evaluation; below, how much of the environment's own state space the collected rows cover. Writes
+FOLDER/table.md.
 """
 
 import csv
 import json
+import sys
 from collections import defaultdict
 from pathlib import Path
 
@@ -16,19 +18,19 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent))
 from train import ARMS, interval95
 
-HERE = Path(__file__).parent
 
-
-def read_runs() -> dict[str, dict[str, dict[int, dict[str, np.ndarray]]]]:
-    """{env: {arm: {seed: {column: values}}}} of every folder here that holds a run.
+def read_runs(folder: Path) -> dict[str, dict[str, dict[int, dict[str, np.ndarray]]]]:
+    """{env: {arm: {seed: {column: values}}}} of every folder in it that holds a run.
 
     Raises:
         ValueError: if two runs are of one environment, arm and seed.
     """
     runs = defaultdict(lambda: defaultdict(dict))
-    for path in sorted(HERE.glob("*/settings.json")):
+    for path in sorted(folder.glob("*/settings.json")):
         settings = json.loads(path.read_text())
         with open(path.with_name("metrics.csv"), newline="") as file:
             rows = list(csv.DictReader(file))
@@ -62,8 +64,8 @@ def draw_curve(axes, seeds: dict[int, dict[str, np.ndarray]], column: str, arm: 
     axes.fill_between(steps, mean - half, mean + half, color=color, alpha=0.12, linewidth=0)
 
 
-def draw(runs, reference) -> None:
-    """Writes curves.png."""
+def draw(path: Path, runs, reference) -> None:
+    """Writes the figure."""
     rows = {"eval_return": "evaluation return", "coverage": "coverage of states, nats"}
     figure, panels = plt.subplots(
         len(rows), len(runs), figsize=(5 * len(runs), 6), sharex="col", squeeze=False
@@ -85,7 +87,7 @@ def draw(runs, reference) -> None:
         column_of_panels[0].legend(fontsize=8)
         column_of_panels[-1].set_xlabel("environment steps")
     figure.tight_layout()
-    figure.savefig(HERE / "curves.png", dpi=90, metadata={"Software": None})
+    figure.savefig(path, dpi=90, metadata={"Software": None})
 
 
 def table(runs, reference) -> str:
@@ -114,9 +116,22 @@ def table(runs, reference) -> str:
     return "\n".join(lines) + "\n"
 
 
-if __name__ == "__main__":
+def main(arguments: list[str]) -> int:
+    """Runs a command line. Returns the exit code: 0 done, 2 bad input."""
+    folder = Path(arguments[0]) if arguments else HERE
     mpl.use("Agg")
-    runs, reference = read_runs(), read_reference()
-    draw(runs, reference)
-    (HERE / "table.md").write_text(table(runs, reference))
+    try:
+        runs, reference = read_runs(folder), read_reference()
+        if not runs:
+            raise ValueError(f"{folder} holds no folder of a run: there is nothing to draw.")
+    except (ValueError, OSError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    draw(folder / "curves.png", runs, reference)
+    (folder / "table.md").write_text(table(runs, reference))
     print(table(runs, reference), end="")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,15 +1,17 @@
 """Returns to be better than: uniformly random actions, and none.
 
-    python -m results.reference
+    python results/reference.py
 
 writes results/reference.csv: ten episodes each, with the seeds of every evaluation; mean return,
 half its 95% interval, mean length in environment steps.
 """
 
+import sys
 from pathlib import Path
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
 from env import make_env
 from train import Settings, interval95
 
