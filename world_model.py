@@ -71,6 +71,15 @@ class Encoder(nn.Module):
         return in_slices(lambda part: self.net(centre(part).permute(0, 3, 1, 2)), image)
 
 
+class Float32ConvTranspose2d(nn.ConvTranspose2d):
+    """A transposed convolution that autocast leaves alone: of these sizes the CPU's kernel for
+    bfloat16 takes 46 ms for 250 maps of depth 32 where float32 takes 22 (depth 16: 22 and 8)."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        with torch.autocast(x.device.type, enabled=False):
+            return super().forward(x.float())
+
+
 class Decoder(nn.Module):
     """States to images: a linear layer, then transposed convolutions of kernels 5, 5, 6, 6, stride
     2 and ReLU.
@@ -86,7 +95,7 @@ class Decoder(nn.Module):
             nn.Linear(inputs, 32 * depth), nn.Linear(32 * depth, 5 * 5 * 4 * depth), nn.ReLU()
         )
         self.net = nn.Sequential(
-            nn.ConvTranspose2d(4 * depth, 2 * depth, 5, stride=2),  # 5 -> 13
+            Float32ConvTranspose2d(4 * depth, 2 * depth, 5, stride=2),  # 5 -> 13
             nn.ReLU(),
             nn.ConvTranspose2d(2 * depth, depth, 6, stride=2),  # 13 -> 30
             nn.ReLU(),

@@ -301,7 +301,7 @@ def test_any_run_can_be_evaluated_and_filmed(uninterrupted, tmp_path):
     assert done.returncode == 0, done.stderr
     assert f"return {float(metrics(folder)[-1]['eval_return']):.1f} " in done.stdout
     with Image.open(folder / "episode-600.gif") as film:
-        assert film.size == (3 * 192, 192) and film.n_frames > 1
+        assert film.size == (3 * 128, 128) and film.n_frames > 1
 
 
 # ---- bad input -----------------------------------------------------------------------------------
