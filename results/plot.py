@@ -59,7 +59,7 @@ def draw_curve(axes, seeds: dict[int, dict[str, np.ndarray]], column: str, arm: 
     length = min(len(run[column]) for run in seeds.values())
     values = np.stack([run[column][:length] for run in seeds.values()])
     steps, mean = next(iter(seeds.values()))["env_steps"][:length], values.mean(0)
-    axes.plot(steps, mean, color=color, label=f"{arm} ({len(seeds)} seeds)")
+    axes.plot(steps, mean, color=color, label=f"{arm}, seeds: {len(seeds)}")
     half = np.array([interval95(v) for v in values.T])
     axes.fill_between(steps, mean - half, mean + half, color=color, alpha=0.12, linewidth=0)
 

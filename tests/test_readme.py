@@ -4,7 +4,8 @@ import importlib
 import re
 from pathlib import Path
 
-README = (Path(__file__).parent.parent / "README.md").read_text()
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
 TABLE = README.split("<!-- equations -->")[1].split("<!-- end of equations -->")[0]
 
 
@@ -36,6 +37,10 @@ def test_the_table_covers_every_labelled_equation_and_modification():
     for modification in ("termination", "rearrangement", "fixed prior", "minor 1", "minor 2"):
         assert modification in TABLE
     assert "minor 3" in TABLE and "minor 4" in TABLE
+
+
+def test_the_table_of_results_is_the_one_that_plot_writes():
+    assert (ROOT / "results" / "table.md").read_text() in README
 
 
 def test_nothing_is_left_to_be_filled_in():
