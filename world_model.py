@@ -71,13 +71,43 @@ class Encoder(nn.Module):
         return in_slices(lambda part: self.net(centre(part).permute(0, 3, 1, 2)), image)
 
 
-class Float32ConvTranspose2d(nn.ConvTranspose2d):
-    """A transposed convolution that autocast leaves alone: of these sizes the CPU's kernel for
-    bfloat16 takes 46 ms for 250 maps of depth 32 where float32 takes 22 (depth 16: 22 and 8)."""
+class TransposedConvolution(torch.autograd.Function):
+    """A transposed convolution of stride 2, each direction in the form that a CPU is fast in.
+
+    Forwards, output pixels of one parity in rows and columns are a plain convolution of half the
+    kernel: all four at once, then interleaved. Backwards, its transpose is a plain convolution, and
+    the bias's gradient is a sum. The decoder's three take 78 ms for 250 images of depth 16 on one
+    thread, in PyTorch's own form 149 (depth 32: 205 and 356).
+    """
+
+    @staticmethod
+    def forward(ctx, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        """(M, I, n, n), (I, O, k, k), (O,) -> (M, O, 2n + k − 2, 2n + k − 2)."""
+        ctx.save_for_backward(x, weight)
+        size, half = 2 * x.shape[-1] + weight.shape[-1] - 2, (weight.shape[-1] + 1) // 2
+        odd = weight.shape[-1] % 2
+        taps = F.pad(weight, (0, odd, 0, odd)).unflatten(3, (half, 2)).unflatten(2, (half, 2))
+        taps = taps.flip(2, 4).permute(3, 5, 1, 0, 2, 4)  # (2, 2, O, I, k/2, k/2)
+        taps = taps.flatten(0, 2).contiguous(memory_format=torch.channels_last)
+        y = F.conv2d(x, taps, bias.repeat(4), padding=half - 1)
+        y = y.permute(0, 2, 3, 1).unflatten(3, (2, 2, -1)).transpose(2, 3)  # (M, n', 2, n', 2, O)
+        return y.flatten(3, 4).flatten(1, 2).permute(0, 3, 1, 2)[..., :size, :size]
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        x, weight = ctx.saved_tensors
+        return (
+            F.conv2d(grad, weight, stride=2),
+            nn.grad.conv2d_weight(grad, weight.shape, x, stride=2),
+            grad.sum((0, 2, 3)),
+        )
+
+
+class TransposedConv2d(nn.ConvTranspose2d):
+    """`nn.ConvTranspose2d` of stride 2 by the function above."""
 
     def forward(self, x: Tensor) -> Tensor:
-        with torch.autocast(x.device.type, enabled=False):
-            return super().forward(x.float())
+        return TransposedConvolution.apply(x, self.weight.to(x.dtype), self.bias.to(x.dtype))
 
 
 class Decoder(nn.Module):
@@ -95,11 +125,11 @@ class Decoder(nn.Module):
             nn.Linear(inputs, 32 * depth), nn.Linear(32 * depth, 5 * 5 * 4 * depth), nn.ReLU()
         )
         self.net = nn.Sequential(
-            Float32ConvTranspose2d(4 * depth, 2 * depth, 5, stride=2),  # 5 -> 13
+            TransposedConv2d(4 * depth, 2 * depth, 5, stride=2),  # 5 -> 13
             nn.ReLU(),
-            nn.ConvTranspose2d(2 * depth, depth, 6, stride=2),  # 13 -> 30
+            TransposedConv2d(2 * depth, depth, 6, stride=2),  # 13 -> 30
             nn.ReLU(),
-            nn.ConvTranspose2d(depth, 3, 6, stride=2),  # 30 -> 64
+            TransposedConv2d(depth, 3, 6, stride=2),  # 30 -> 64
         ).to(memory_format=torch.channels_last)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -216,23 +246,25 @@ class WorldModel(nn.Module):
         length = image.shape[1]
         embedding = self.encoder(image.flatten(0, 1)).unflatten(0, image.shape[:2])
         # (B, T, hidden) each: what needs no recurrence is computed for all steps at once
-        embed_share = self.posterior_embed(embedding)
-        action_share = self.dense_action(action)
+        embed_share = self.posterior_embed(embedding).float()
+        action_share = self.dense_action(action).float()
         noise = torch.randn(*image.shape[:2], self.stoch, device=image.device)
         going_on = (~is_first).float().unsqueeze(-1)
         if previous is None:
             previous = torch.zeros(len(image), self.size, device=image.device)
         deter, stoch = previous.split([self.deter, self.stoch], -1)
         deters, stochs, statistics = [], [], []
-        for t in range(length):
-            # h_0 = 0: nothing of the episode before passes, nor of its z, which enters by h alone
-            deter = going_on[:, t] * self.recur(deter, stoch, action_share[:, t])
-            out = self.posterior_out(F.elu(self.posterior_deter(deter) + embed_share[:, t]))
-            posterior = normal(out)
-            stoch = posterior.mean + posterior.stddev * noise[:, t]
-            if not self.observe_first:
-                stoch = going_on[:, t] * stoch
-            deters.append(deter), stochs.append(stoch), statistics.append(out)
+        # In float32: for so few rows a product costs less than its casts (68 ms in place of 78).
+        with torch.autocast(image.device.type, enabled=False):
+            for t in range(length):
+                # h_0 = 0: nothing of the episode before passes, nor of its z, which is in h alone
+                deter = going_on[:, t] * self.recur(deter, stoch, action_share[:, t])
+                out = self.posterior_out(F.elu(self.posterior_deter(deter) + embed_share[:, t]))
+                posterior = normal(out)
+                stoch = posterior.mean + posterior.stddev * noise[:, t]
+                if not self.observe_first:
+                    stoch = going_on[:, t] * stoch
+                deters.append(deter), stochs.append(stoch), statistics.append(out)
         deter = torch.stack(deters, 1)  # (B, T, deter)
         state = torch.cat([deter, torch.stack(stochs, 1)], -1)
         return Observed(state, normal(torch.stack(statistics, 1)), normal(self.prior_net(deter)))

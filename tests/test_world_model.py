@@ -11,7 +11,7 @@ from torch import nn
 from torch.distributions import Normal
 
 import world_model
-from world_model import Decoder, Encoder, WorldModel, in_slices
+from world_model import Decoder, Encoder, TransposedConv2d, WorldModel, in_slices
 
 ACTIONS, DETER, STOCH = 2, 8, 4
 
@@ -193,6 +193,22 @@ def test_decoder_is_the_authors_stack_of_four_transposed_convolutions():
         maps = F.relu(F.conv_transpose2d(maps, layer.weight, layer.bias, stride=2))
     images = F.conv_transpose2d(maps, layers[-1].weight, layers[-1].bias, stride=2)
     torch.testing.assert_close(decoder(x), images.permute(0, 2, 3, 1))
+
+
+@pytest.mark.parametrize("kernel, n", [(5, 5), (6, 13), (6, 30), (2, 1)])
+def test_transposed_convolution_is_torchs_in_values_and_gradients(kernel, n):
+    fast = TransposedConv2d(6, 4, kernel, stride=2)
+    plain = nn.ConvTranspose2d(6, 4, kernel, stride=2)
+    plain.load_state_dict(fast.state_dict())
+    x = torch.randn(3, 6, n, n, requires_grad=True)
+
+    def run(layer):
+        y = layer(x)
+        weights = torch.linspace(-1, 1, y.numel()).view(y.shape)
+        return [y, *torch.autograd.grad((weights * y.square()).sum(), [x, *layer.parameters()])]
+
+    for own, torchs in zip(run(fast), run(plain), strict=True):
+        torch.testing.assert_close(own, torchs, rtol=1e-4, atol=1e-4)
 
 
 def test_encoder_is_the_authors_stack_of_four_convolutions():
