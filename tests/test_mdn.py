@@ -62,6 +62,21 @@ def test_log_prob_is_that_of_torch_distributions(dtype):
     torch.testing.assert_close(got.double(), expected, rtol=1e-6, atol=0)
 
 
+def test_gradients_of_log_prob_are_those_of_torch_distributions():
+    """Each to a ten-thousandth of the largest: float32 knows log-densities of thousands of nats, and
+    so which component a point is of, to some 5e-4."""
+    mixture, x = random_mixture(5, 8, 328), torch.randn(23, 5, 328)
+    inputs = [tensor.requires_grad_() for tensor in (x, *mixture)]
+    got = torch.autograd.grad(mixture.log_prob(x).sum(), inputs)
+    log_prob = reference(mixture).log_prob(x.double())
+    expected = torch.autograd.grad(log_prob.sum(), inputs)
+    for own, torchs in zip(got[:1] + got[2:], expected[:1] + expected[2:], strict=True):
+        assert (own - torchs).abs().max() <= 1e-4 * torchs.abs().max()
+    # Categorical normalises the weights, which are already: it takes out their mean direction
+    tangent = got[1] - mixture.log_weights.exp() * got[1].sum(1, keepdim=True)
+    torch.testing.assert_close(tangent, expected[1], rtol=1e-4, atol=1e-3)
+
+
 def test_log_prob_and_its_gradient_are_finite_a_thousand_deviations_away():
     mixture = random_mixture(4, 8, 6)
     x = (1000 * mixture.std.amax(1)).unsqueeze(0).requires_grad_()
