@@ -63,8 +63,8 @@ def test_log_prob_is_that_of_torch_distributions(dtype):
 
 
 def test_gradients_of_log_prob_are_those_of_torch_distributions():
-    """Each to a ten-thousandth of the largest: float32 knows log-densities of thousands of nats, and
-    so which component a point is of, to some 5e-4."""
+    """Each to a ten-thousandth of the largest: float32 knows log-densities of thousands of nats to
+    some 5e-4, and so which component a point is of."""
     mixture, x = random_mixture(5, 8, 328), torch.randn(23, 5, 328)
     inputs = [tensor.requires_grad_() for tensor in (x, *mixture)]
     got = torch.autograd.grad(mixture.log_prob(x).sum(), inputs)

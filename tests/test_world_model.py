@@ -197,7 +197,7 @@ def test_decoder_is_the_authors_stack_of_four_transposed_convolutions():
 
 @pytest.mark.parametrize("kernel, n", [(5, 5), (6, 13), (6, 30), (2, 1)])
 def test_transposed_convolution_is_torchs_in_values_and_gradients(kernel, n):
-    fast = TransposedConv2d(6, 4, kernel, stride=2)
+    fast = TransposedConv2d(6, 4, kernel)
     plain = nn.ConvTranspose2d(6, 4, kernel, stride=2)
     plain.load_state_dict(fast.state_dict())
     x = torch.randn(3, 6, n, n, requires_grad=True)
@@ -209,6 +209,16 @@ def test_transposed_convolution_is_torchs_in_values_and_gradients(kernel, n):
 
     for own, torchs in zip(run(fast), run(plain), strict=True):
         torch.testing.assert_close(own, torchs, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_transposed_convolution_keeps_the_precision_of_its_input_under_autocast(dtype):
+    layer, x = TransposedConv2d(6, 4, 6), torch.randn(3, 6, 13, 13).to(dtype).requires_grad_()
+    with torch.autocast("cpu", torch.bfloat16):
+        y = layer(x)
+    y.float().square().sum().backward()
+    assert y.dtype == x.grad.dtype == dtype
+    assert layer.weight.grad.dtype == torch.float32
 
 
 def test_encoder_is_the_authors_stack_of_four_convolutions():
