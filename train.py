@@ -71,7 +71,7 @@ class Settings:
     precision: Precision = "auto"  # auto: bfloat16 if the processor has it in hardware
 
     steps: int = 100_000  # environment steps of the run, prefill included (ours)
-    prefill: int = 5000  # environment steps of uniformly random actions before training (Dreamer)
+    prefill: int = 5000  # environment steps of random actions before training (Dreamer: 5000)
     train_every: int = 10  # environment steps between two rounds of updates (Dreamer: 1000)
     updates: int = 1  # gradient updates a round (Dreamer: 100)
     eval_every: int = 10_000  # environment steps between evaluations, once training began (ours)
@@ -94,13 +94,13 @@ class Settings:
     random_action: float = 0.1  # §4.2 minor 4: probability of a random action (its value ours)
     collect: Collect = "both"  # who collects: the explorer alone, or both actors in turn (ours)
 
-    deter: int = 200  # size of h (Dreamer)
+    deter: int = 200  # size of h (Dreamer: 200)
     stoch: int = 128  # size of z (§5: 128; Dreamer: 30)
-    hidden: int = 200  # units of the RSSM's dense layers (Dreamer)
-    units: int = 400  # units of reward, termination, actor and critic layers (Dreamer)
-    depth: int = 32  # channels of the first convolution (Dreamer)
-    batch_size: int = 50  # sequences a batch (Dreamer)
-    length: int = 50  # rows a sequence (Dreamer)
+    hidden: int = 200  # units of the RSSM's dense layers (Dreamer: 200)
+    units: int = 400  # of reward, termination, actor and critic layers (Dreamer: 400)
+    depth: int = 32  # channels of the first convolution (Dreamer: 32)
+    batch_size: int = 50  # sequences a batch (Dreamer: 50)
+    length: int = 50  # rows a sequence (Dreamer: 50)
     horizon: int = 15  # imagined steps, and n of Eq. (10) (Dreamer)
 
     gamma: float = 0.99  # γ of λ-returns, a decision (Dreamer)
@@ -109,7 +109,7 @@ class Settings:
     beta_start: float = 0.2  # entropy coefficient β at the first environment step (§5)
     beta_end: float = 0.0001  # and at the last, linear between (§5)
     mdn_components: int = 8  # components of the mixture density network (§5: heads)
-    mdn_units: int = 256  # its hidden units (§5)
+    mdn_units: int = 256  # its hidden units (§5: 256)
     mdn_min_std: float = 0.1  # floor under its σ (ours)
     target_rate: float = 0.1  # soft update of the target MDN (§5)
     first_action_noise: float = 0.1  # on the deterministic actor's first imagined action (ours)
@@ -733,11 +733,9 @@ class Command:
 
     settings: tyro.conf.OmitArgPrefixes[Settings]
     resume: str | None = None  # folder of a run to go on with, by its own settings
-    evaluate: str | None = (
-        None  # folder of a run whose newest checkpoint to evaluate, by its own settings
-    )
+    evaluate: str | None = None  # folder of a run, whose newest checkpoint to evaluate
     episodes: int = 10  # to evaluate
-    video: bool = False  # with --evaluate: an animated GIF of an episode beside its dream
+    video: bool = False  # with --evaluate: an animated GIF of the best episode beside its dream
 
 
 def parse(arguments: list[str]) -> Command:

@@ -9,6 +9,7 @@ FOLDER/table.md.
 """
 
 import csv
+import dataclasses
 import json
 import sys
 from collections import defaultdict
@@ -20,27 +21,53 @@ import numpy as np
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
-from train import ARMS, interval95
+from train import ARMS, default_settings, interval95
+
+# what may differ between runs of one line: who and where, not what is learnt
+NOT_LEARNT = {
+    "env",
+    "seed",
+    "run_dir",
+    "device",
+    "eval_every",
+    "eval_episodes",
+    "checkpoint_minutes",
+}
+
+
+def label(settings: dict) -> str:
+    """The arm and the settings that the run changes in it: no line mixes two experiments."""
+    usual = dataclasses.asdict(default_settings(settings["arm"], settings["preset"]))
+    usual |= {"preset": default_settings().preset}
+    changed = [k for k in usual if k not in NOT_LEARNT and settings.get(k) != usual[k]]
+    return ", ".join([settings["arm"]] + [f"{k} {settings.get(k)}" for k in changed])
 
 
 def read_runs(folder: Path) -> dict[str, dict[str, dict[int, dict[str, np.ndarray]]]]:
-    """{env: {arm: {seed: {column: values}}}} of every folder in it that holds a run.
+    """{env: {label: {seed: {column: values}}}} of every folder in it that holds a run.
+
+    A run that has not been evaluated yet is left out.
 
     Raises:
-        ValueError: if two runs are of one environment, arm and seed.
+        ValueError: if two runs are one experiment with one seed, or two seeds of one were evaluated
+            at different steps.
     """
     runs = defaultdict(lambda: defaultdict(dict))
     for path in sorted(folder.glob("*/settings.json")):
         settings = json.loads(path.read_text())
-        with open(path.with_name("metrics.csv"), newline="") as file:
-            rows = list(csv.DictReader(file))
+        metrics = path.with_name("metrics.csv")
+        lines = metrics.read_text().splitlines() if metrics.exists() else []
+        rows = list(csv.DictReader(lines))
+        if not rows:
+            continue
         columns = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
-        # a row is written at the end of the decision that passes a multiple of eval_every
-        every = settings["eval_every"]
-        columns["env_steps"] = every * np.round(columns["env_steps"] / every)
-        seeds = runs[settings["env"]][settings["arm"]]
+        seeds = runs[settings["env"]][label(settings)]
         if settings["seed"] in seeds:
             raise ValueError(f"{path.parent} repeats the seed of another run here: remove one.")
+        for other in seeds.values():
+            pairs = zip(columns["env_steps"], other["env_steps"], strict=False)
+            if any(abs(a - b) >= settings["action_repeat"] for a, b in pairs):
+                raise ValueError(f"{path.parent} was evaluated at other steps than another seed.")
         seeds[settings["seed"]] = columns
     return runs
 
@@ -51,29 +78,30 @@ def read_reference() -> dict[tuple[str, str], dict[str, str]]:
         return {(row["env"], row["policy"]): row for row in csv.DictReader(file)}
 
 
-def draw_curve(axes, seeds: dict[int, dict[str, np.ndarray]], column: str, arm: str) -> None:
-    """One arm's line: up to the last step that all of its seeds have reached."""
-    color = f"C{list(ARMS).index(arm)}"
+def draw_curve(axes, seeds: dict[int, dict], column: str, name: str, color: str) -> None:
+    """One experiment's line: up to the last step that all of its seeds have reached."""
     for run in seeds.values():
         axes.plot(run["env_steps"], run[column], color=color, alpha=0.35, linewidth=0.8)
     length = min(len(run[column]) for run in seeds.values())
     values = np.stack([run[column][:length] for run in seeds.values()])
     steps, mean = next(iter(seeds.values()))["env_steps"][:length], values.mean(0)
-    axes.plot(steps, mean, color=color, label=f"{arm}, seeds: {len(seeds)}")
+    axes.plot(steps, mean, color=color, label=f"{name}, seeds: {len(seeds)}")
     half = np.array([interval95(v) for v in values.T])
     axes.fill_between(steps, mean - half, mean + half, color=color, alpha=0.12, linewidth=0)
 
 
 def draw(path: Path, runs, reference) -> None:
     """Writes the figure."""
+    names = dict.fromkeys([*ARMS, *sorted({name for arms in runs.values() for name in arms})])
+    colors = {name: f"C{k}" for k, name in enumerate(names)}  # an arm has one colour everywhere
     rows = {"eval_return": "evaluation return", "coverage": "coverage of states, nats"}
     figure, panels = plt.subplots(
         len(rows), len(runs), figsize=(5 * len(runs), 6), sharex="col", squeeze=False
     )
     for (env, arms), column_of_panels in zip(sorted(runs.items()), panels.T, strict=True):
         for axes, (column, label) in zip(column_of_panels, rows.items(), strict=True):
-            for arm, seeds in arms.items():
-                draw_curve(axes, seeds, column, arm)
+            for name, seeds in arms.items():
+                draw_curve(axes, seeds, column, name, colors[name])
             every_value = np.concatenate([r[column] for seeds in arms.values()
                                           for r in seeds.values()])  # fmt: skip
             margin = 0.1 * np.ptp(every_value) + 1  # an interval over two seeds may leave the panel
@@ -81,6 +109,8 @@ def draw(path: Path, runs, reference) -> None:
             axes.set_ylabel(label)
             if column == "eval_return":
                 for policy, style in (("random", ":"), ("zero", "--")):
+                    if (env, policy) not in reference:
+                        continue
                     earned = float(reference[env, policy]["return"])
                     axes.axhline(earned, color="grey", linestyle=style, label=f"{policy} actions")
                 axes.set_title(env)
@@ -99,16 +129,17 @@ def table(runs, reference) -> str:
     ]
     for env, arms in sorted(runs.items()):
         for policy in ("random", "zero"):
-            row = reference[env, policy]
+            if not (row := reference.get((env, policy))):
+                continue
             lines.append(
                 f"| {env} | {policy} actions | – | – | – | {row['return']} ± {row['interval95']} "
                 f"| – | {row['length']} | – |"
             )
-        for arm, seeds in arms.items():
+        for name, seeds in arms.items():
             for seed, run in sorted(seeds.items()):
-                last = {name: values[-1] for name, values in run.items()}
+                last = {column: values[-1] for column, values in run.items()}
                 lines.append(
-                    f"| {env} | {arm} | {seed} | {last['env_steps']:,.0f} "
+                    f"| {env} | {name} | {seed} | {last['env_steps']:,.0f} "
                     f"| {last['wall_seconds'] / 60:.0f} | {last['eval_return']:.1f} "
                     f"± {last['eval_interval95']:.1f} | {run['eval_return'].max():.1f} "
                     f"| {last['eval_length']:.0f} | {run['coverage'].mean():.1f} |"
@@ -123,7 +154,7 @@ def main(arguments: list[str]) -> int:
     try:
         runs, reference = read_runs(folder), read_reference()
         if not runs:
-            raise ValueError(f"{folder} holds no folder of a run: there is nothing to draw.")
+            raise ValueError(f"{folder} holds no evaluated run in a folder: nothing to draw.")
     except (ValueError, OSError) as error:
         print(error, file=sys.stderr)
         return 2

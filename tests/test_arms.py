@@ -18,6 +18,7 @@ from train import (
     beta_at,
     default_settings,
     interval95,
+    parse,
     to_tensors,
     update,
 )
@@ -170,6 +171,27 @@ def test_arms_hold_the_networks_of_the_table_and_evaluate_the_right_actor(arm):
     assert (agent.model.termination is not None) == (arm in ("revised", "maxent"))
     critic = agent.critics["stochastic"].net[0].in_features
     assert critic == 8 + s.stoch + ACTIONS * (arm in ("revised", "maxent"))  # Q(s, a) or V(s)
+
+
+@pytest.mark.parametrize("collect, turns", [("explorer", "SSSS"), ("both", "SDSD")])
+def test_the_explorer_collects_alone_or_in_turn_with_the_deterministic_actor(collect, turns):
+    agent = make_agent(tiny("maxent", collect=collect))
+    actors = {"S": agent.actors["stochastic"], "D": agent.actors["deterministic"]}
+    assert [agent.collector(k) for k in range(4)] == [actors[turn] for turn in turns]
+    alone = make_agent(tiny("revised", collect=collect))
+    assert [alone.collector(k) for k in range(2)] == 2 * [alone.actors["stochastic"]]
+
+
+SWITCHES = [name for name, value in dataclasses.asdict(Settings()).items() if value is True]
+
+
+@pytest.mark.parametrize("name", SWITCHES)
+def test_each_modification_can_be_taken_away_alone_and_still_trains(name):
+    s = parse([f"--no-{name.replace('_', '-')}"]).settings
+    assert s == dataclasses.replace(default_settings(), **{name: False})
+    _, metrics = updated(tiny("maxent", **{name: False}))
+    assert all(math.isfinite(value) for value in metrics.values())
+    assert metrics != updated(tiny("maxent"))[1]
 
 
 @pytest.mark.parametrize("observe_first", [True, False])

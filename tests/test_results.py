@@ -1,15 +1,17 @@
 """results/: the diagnosis holds predictions against the right row; the figure needs files alone."""
 
+import dataclasses
 import json
 import shutil
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 import results.diagnose as diagnose
 import results.plot as plot
-from train import Agent, Episode, Settings, main
+from train import Agent, Episode, Settings, default_settings, main
 
 TINY = dict(
     deter=16, stoch=8, hidden=16, units=16, depth=2, mdn_units=16, horizon=5, batch_size=3,
@@ -94,6 +96,43 @@ def test_bad_input_ends_with_one_sentence(tmp_path, capsys):
     for program in (diagnose, plot):
         assert program.main([str(tmp_path)]) == 2
         assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+def write_run(folder: Path, rows: str, **changes) -> None:
+    """A run's folder of a line of settings and these rows of return at steps 5,000, 10,000 …"""
+    settings = dataclasses.asdict(dataclasses.replace(default_settings(), **changes))
+    folder.mkdir(parents=True)
+    (folder / "settings.json").write_text(json.dumps(settings))
+    lines = [f"{5000 * k},60,{r},1,9,2.5" for k, r in enumerate(rows.split(), 1)]
+    names = "env_steps,wall_seconds,eval_return,eval_interval95,eval_length,coverage"
+    (folder / "metrics.csv").write_text("\n".join([names, *lines]) if lines else "")
+
+
+def test_a_run_with_a_switch_of_its_own_is_another_line(tmp_path):
+    write_run(tmp_path / "a", "1 2", seed=0)
+    write_run(tmp_path / "b", "3 5", seed=1, run_dir="elsewhere")
+    write_run(tmp_path / "c", "7", seed=1, q_critic=False, preset="paper")
+    write_run(tmp_path / "d", "")  # not yet evaluated: left out
+    runs = plot.read_runs(tmp_path)["HopperBulletEnv-v0"]
+    assert sorted(runs["maxent"]) == [0, 1]
+    (other,) = runs.keys() - {"maxent"}
+    assert other.startswith("maxent, preset paper") and "q_critic False" in other
+
+
+def test_an_environment_without_reference_is_drawn_too(tmp_path):
+    write_run(tmp_path / "a", "1 2", env="HumanoidBulletEnv-v0")
+    assert plot.main([str(tmp_path)]) == 0
+    assert "| HumanoidBulletEnv-v0 | maxent | 0 | 10,000 |" in (tmp_path / "table.md").read_text()
+
+
+@pytest.mark.parametrize("seed, rows, wrong", [(0, "1 2", "repeats the seed"), (1, "1", "steps")])
+def test_runs_that_cannot_be_averaged_are_refused(seed, rows, wrong, tmp_path, capsys):
+    write_run(tmp_path / "a", "1 2")
+    write_run(tmp_path / "b", rows, seed=seed)
+    path = tmp_path / "b" / "metrics.csv"
+    path.write_text(path.read_text().replace("\n5000,", "\n7000,"))
+    assert plot.main([str(tmp_path)]) == 2
+    assert wrong in capsys.readouterr().err
 
 
 def test_committed_runs_give_the_committed_table(tmp_path):

@@ -91,6 +91,19 @@ def test_equal_seeds_give_equal_metrics_and_other_seeds_others(tmp_path):
     assert metrics(tmp_path / "a") != metrics(tmp_path / "c")
 
 
+def test_coverage_is_of_the_rows_since_the_last_evaluation(tmp_path, monkeypatch):
+    rows = []
+    monkeypatch.setattr("train.coverage", lambda states: rows.append(states.shape) or 0.0)
+    monkeypatch.setitem(
+        gym.registry, "NumPy-v0", EnvSpec("NumPy-v0", NumPyEnv, max_episode_steps=50)
+    )
+    folder = str(tmp_path / "run")
+    arguments = ["--env", "NumPy-v0", "--steps", "140", "--eval-every", "35", "--run-dir", folder]
+    assert main([*arguments, *TINY]) == 0
+    # episodes of seven steps are four decisions: 70, 105 and 140 steps are 40, 60 and 80
+    assert rows == [(40, 1), (20, 1), (20, 1)]
+
+
 # ---- runs that are never lost --------------------------------------------------------------------
 
 LONG = ["--steps", 600, "--eval-every", 200, "--checkpoint-minutes", 0.002, *TINY]
@@ -367,4 +380,8 @@ def test_help_explains_every_setting(capsys):
     text = capsys.readouterr().out
     for name in Settings.__dataclass_fields__:
         assert f"--{name.replace('_', '-')}" in text
+    options = re.split(r"│ (?=-)", text)[1:]  # from one option to the next
+    assert [
+        o for o in options if not re.search(r"[a-z]{2,} [a-z]{2,}", o.split("(default")[0])
+    ] == []
     assert "stoch INT" in text and "30" in text  # the arm's own value is shown
