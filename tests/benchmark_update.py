@@ -2,9 +2,11 @@
 
     pytest tests/benchmark_update.py --benchmark-only
 
-prints pytest-benchmark's table and, below it, one line a benchmark: seconds of the parts of an
-update, floating-point operations, the machine's own matrix rates and the fraction reached.
-Not part of the default tests.
+prints pytest-benchmark's table and, above it, the rows of the README's table, one a benchmark:
+seconds of an update (median and least) and of its parts, floating-point operations, the machine's
+own matrix rates in bfloat16 and float32, the fraction of the first that is reached, and the peak
+memory; then decisions and environment steps a second of collection. With `| grep '^|'` the rows
+alone. Not part of the default tests.
 """
 
 import ctypes
@@ -36,7 +38,7 @@ keep_freed_memory()
 CPU = torch.device("cpu")
 PARTS = {
     "model": "world model", "stochastic_actor": "explorer", "stochastic_critic": "explorer",
-    "mdn": "MDN", "deterministic_actor": "deterministic", "deterministic_critic": "deterministic",
+    "deterministic_actor": "deterministic", "deterministic_critic": "deterministic", "mdn": "MDN",
 }  # fmt: skip
 
 
@@ -107,19 +109,19 @@ def test_update(arm, preset, benchmark, capsys, monkeypatch):
         agent.clock = time.perf_counter()
         update(agent, batch, 0.1, s)
 
-    rounds = 10 if preset == "small" else 3
+    rounds = 20 if preset == "small" else 3
     benchmark.pedantic(timed, rounds=rounds)
     gflop, fast, slow = (
         counter.get_total_flops() / 1e9,
         *map(matrix_rate, (torch.bfloat16, torch.float32)),
     )
-    seconds = benchmark.stats.stats.median
-    parts = ", ".join(f"{name} {total / rounds:.3f}" for name, total in agent.seconds.items())
+    seconds, least = benchmark.stats.stats.median, benchmark.stats.stats.min
+    spent = [agent.seconds.get(part, 0) / rounds for part in dict.fromkeys(PARTS.values())]
+    parts = " | ".join(f"{part:.3f}" if part else "–" for part in spent)
     with capsys.disabled():
         print(
-            f"\n{arm}, {preset}: {seconds:.3f} s an update ({parts}); {gflop:.0f} GFLOP; "
-            f"bfloat16 {fast:.0f} and float32 {slow:.0f} GFLOP/s; "
-            f"{gflop / seconds / fast:.2f} of bfloat16; peak memory {peak():.1f} GiB"
+            f"\n| {arm} | {preset} | {seconds:.3f} | {least:.3f} | {parts} | {gflop:.0f} "
+            f"| {fast:.0f}, {slow:.0f} | {gflop / seconds / fast:.2f} | {peak():.1f} |"
         )
 
 
@@ -146,6 +148,6 @@ def test_collection(preset, benchmark, capsys):
     rate = 80 / benchmark.stats.stats.median
     with capsys.disabled():
         print(
-            f"\n{preset}: {rate:.0f} decisions, {s.action_repeat * rate:.0f} environment steps "
-            "a second"
+            f"\n| collection | {preset} | {rate:.0f} decisions, "
+            f"{s.action_repeat * rate:.0f} environment steps a second |"
         )

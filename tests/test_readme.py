@@ -43,5 +43,10 @@ def test_the_table_of_results_is_the_one_that_plot_writes():
     assert (ROOT / "results" / "table.md").read_text() in README
 
 
+def test_the_table_of_speed_is_what_the_benchmark_printed():
+    rows = (ROOT / "results" / "benchmark.md").read_text().splitlines()
+    assert len(rows) == 10 and not [row for row in rows if row not in README]
+
+
 def test_nothing_is_left_to_be_filled_in():
     assert "@@" not in README
