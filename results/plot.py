@@ -57,7 +57,7 @@ def read_runs(folder: Path) -> dict[str, dict[str, dict[int, dict[str, np.ndarra
         settings = json.loads(path.read_text())
         metrics = path.with_name("metrics.csv")
         lines = metrics.read_text().splitlines() if metrics.exists() else []
-        rows = list(csv.DictReader(lines))
+        rows = [row for row in csv.DictReader(lines) if None not in row.values()]  # whole ones
         if not rows:
             continue
         columns = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}

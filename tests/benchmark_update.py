@@ -93,7 +93,7 @@ class TimedAgent(Agent):
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("arm", ARMS)
 def test_update(arm, preset, benchmark, capsys, monkeypatch):
-    s, peak = default_settings(arm, preset), PeakMemory()
+    s = default_settings(arm, preset)
     torch.manual_seed(0)
     agent = TimedAgent(s, 3, CPU, bfloat16=has_bfloat16(CPU))
     batch = random_batch(s.batch_size, s.length, 3)
@@ -104,6 +104,7 @@ def test_update(arm, preset, benchmark, capsys, monkeypatch):
         patch.setattr(TransposedConv2d, "forward", torch.nn.ConvTranspose2d.forward)
         update(agent, batch, 0.1, s)
     agent.seconds.clear()
+    peak = PeakMemory()
 
     def timed() -> None:
         agent.clock = time.perf_counter()
@@ -111,6 +112,7 @@ def test_update(arm, preset, benchmark, capsys, monkeypatch):
 
     rounds = 20 if preset == "small" else 3
     benchmark.pedantic(timed, rounds=rounds)
+    memory = peak()
     gflop, fast, slow = (
         counter.get_total_flops() / 1e9,
         *map(matrix_rate, (torch.bfloat16, torch.float32)),
@@ -121,7 +123,7 @@ def test_update(arm, preset, benchmark, capsys, monkeypatch):
     with capsys.disabled():
         print(
             f"\n| {arm} | {preset} | {seconds:.3f} | {least:.3f} | {parts} | {gflop:.0f} "
-            f"| {fast:.0f}, {slow:.0f} | {gflop / seconds / fast:.2f} | {peak():.1f} |"
+            f"| {fast:.0f}, {slow:.0f} | {gflop / seconds / fast:.2f} | {memory:.1f} |"
         )
 
 
