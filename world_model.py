@@ -86,6 +86,7 @@ class TransposedConvolution(torch.autograd.Function):
         ctx.save_for_backward(x, weight)
         size, half = 2 * x.shape[-1] + weight.shape[-1] - 2, (weight.shape[-1] + 1) // 2
         odd = weight.shape[-1] % 2
+        # Output pixel 2i + p meets the kernel's taps 2j + p alone, at inputs i − j: hence the flip.
         taps = F.pad(weight, (0, odd, 0, odd)).unflatten(3, (half, 2)).unflatten(2, (half, 2))
         taps = taps.flip(2, 4).permute(3, 5, 1, 0, 2, 4)  # (2, 2, O, I, k/2, k/2)
         taps = taps.flatten(0, 2).contiguous(memory_format=torch.channels_last)
