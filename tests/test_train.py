@@ -380,8 +380,8 @@ def test_help_explains_every_setting(capsys):
     text = capsys.readouterr().out
     for name in Settings.__dataclass_fields__:
         assert f"--{name.replace('_', '-')}" in text
-    options = re.split(r"│ (?=-)", text)[1:]  # from one option to the next
-    assert [
-        o for o in options if not re.search(r"[a-z]{2,} [a-z]{2,}", o.split("(default")[0])
-    ] == []
+    options = re.split(r"\n\W*?(?=--?[a-z])", text)[1:]  # from one option to the next
+    assert len(options) > len(Settings.__dataclass_fields__)
+    for option in options:
+        assert re.search(r"\s[a-z]+\s", option.split("(default")[0]), option
     assert "stoch INT" in text and "30" in text  # the arm's own value is shown
