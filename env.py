@@ -17,6 +17,7 @@ from scipy.spatial import KDTree
 from scipy.special import digamma, gammaln
 
 IMAGE_SIZE = 64
+MAX_STATES, MAX_DIMENSIONS = 5000, 64  # of `coverage`: a second
 
 
 def make_env(env_id: str, action_repeat: int = 2, camera_distance: float | None = None) -> gym.Env:
@@ -111,15 +112,22 @@ def coverage(states: np.ndarray, k: int = 3) -> float:
     1e-6 at least: states that repeat exactly have no density.
 
     Args:
-        states: (n, d), in the environment's own units.
+        states: (n, d), in the environment's own units; of more than 5,000, as many evenly spaced.
         k: neighbours; more have less variance and more bias.
 
     Returns:
-        nats; nan for fewer than k + 1 states.
+        nats; nan for fewer than k + 1 states, if any is not finite, and for no dimensions or more
+        than 64, where the estimate means nothing and takes minutes.
     """
-    n, d = states.shape
-    if n <= k:
+    try:
+        states = np.asarray(states, np.float64)
+        n, d = states.shape
+    except (TypeError, ValueError):  # no array of so many numbers each
         return float("nan")
+    if n <= k or not 0 < d <= MAX_DIMENSIONS or not np.isfinite(states).all():
+        return float("nan")
+    n = min(n, MAX_STATES)
+    states = states[np.linspace(0, len(states) - 1, n).astype(int)]
     distance = KDTree(states).query(states, k + 1)[0][:, k]  # the nearest is the state itself
     log_ball = d / 2 * np.log(np.pi) - gammaln(d / 2 + 1)
     spread = d * np.log(np.maximum(distance, 1e-6)).mean()

@@ -1,6 +1,7 @@
 """env.py on real PyBullet environments and on toys with known rewards; replay by exhaustion."""
 
 import gc
+import time
 
 import gymnasium as gym
 import numpy as np
@@ -307,6 +308,46 @@ def test_coverage_grows_by_the_log_of_the_scale():
 def test_coverage_of_repeated_states_is_finite_and_of_too_few_nan():
     assert np.isfinite(coverage(np.zeros((10, 3))))
     assert np.isnan(coverage(np.zeros((3, 3))))
+
+
+@pytest.mark.parametrize(
+    "states",
+    [
+        np.full((9, 3), np.nan),
+        np.where(np.arange(27).reshape(9, 3) == 4, np.inf, 1.0),
+        np.zeros((9, 0)),
+        np.zeros((0, 3)),
+        np.zeros((0, 0)),
+        np.zeros((9, 65)),
+        np.zeros(9),
+        np.zeros((9, 3, 2)),
+        np.array([["a", "b"]] * 9),
+        [[1, 2], [3]],
+        None,
+    ],
+    ids=str,
+)
+def test_coverage_of_what_has_none_is_nan(states):
+    assert np.isnan(coverage(states))
+
+
+def test_coverage_of_extreme_states_raises_nothing():
+    for scale in (1e-300, 1e30, 1e300):
+        coverage(scale * np.random.default_rng(0).standard_normal((100, 3)))
+
+
+@pytest.mark.parametrize("d", [2, 64, 27648])
+def test_coverage_takes_about_a_second_at_most(d):
+    states = np.random.default_rng(0).standard_normal((20_000 if d < 99 else 700, d), np.float32)
+    start = time.process_time()
+    coverage(states)
+    assert time.process_time() - start < 5  # 1 here, and minutes without its bounds
+
+
+def test_coverage_of_many_states_is_that_of_evenly_spaced_ones():
+    states = np.random.default_rng(0).standard_normal((9999, 2))
+    assert coverage(states) == coverage(states[::2])
+    assert coverage(states) == pytest.approx(np.log(2 * np.pi) + 1, abs=0.1)
 
 
 def test_the_environments_own_state_is_in_info_and_not_in_the_observation(make):
