@@ -6,11 +6,13 @@ arrival-indexed: an observation stands beside the action that led to it and the 
 termination received with it.
 """
 
+import contextlib
+import ctypes
 import difflib
+import os
 
 import gymnasium as gym
 import numpy as np
-import pybullet_envs_gymnasium  # noqa: F401, registers the PyBullet environments
 from gymnasium import wrappers
 from PIL import Image
 from scipy.spatial import KDTree
@@ -18,6 +20,29 @@ from scipy.special import digamma, gammaln
 
 IMAGE_SIZE = 64
 MAX_STATES, MAX_DIMENSIONS = 5000, 64  # of `coverage`: a second
+
+
+@contextlib.contextmanager
+def silence():
+    """Discards what C code prints, which `contextlib.redirect_stdout` does not see."""
+    with open(os.devnull, "w") as null, contextlib.ExitStack() as last:
+        for stream in (1, 2):
+            with contextlib.suppress(OSError):  # it is closed
+                last.callback(os.close, copy := os.dup(stream))
+                last.callback(os.dup2, copy, stream)
+                os.dup2(null.fileno(), stream)
+        if hasattr(ctypes.pythonapi, "fflush"):  # else C prints later, to a pipe; not on Windows
+            last.callback(ctypes.pythonapi.fflush, None)
+        yield
+
+
+with silence():
+    import pybullet
+    import pybullet_envs_gymnasium  # noqa: F401, registers the PyBullet environments
+
+    # Robots ask client 0 for their Euler angles, whichever is theirs. Were that the first robot's,
+    # no other could go on after it is closed: "Not connected to physics server".
+    pybullet.connect(pybullet.DIRECT)
 
 
 def make_env(env_id: str, action_repeat: int = 2, camera_distance: float | None = None) -> gym.Env:
@@ -51,7 +76,8 @@ def make_env(env_id: str, action_repeat: int = 2, camera_distance: float | None 
         # PyBullet loads its world at the first reset and restores it at later ones, with other
         # contacts: after this one, an episode is a function of its seed and actions alone, in this
         # process or in one that resumes it.
-        env.reset(seed=0)
+        with silence():
+            env.reset(seed=0)
         if not isinstance(env.render(), np.ndarray):
             raise ValueError("it renders no images")
         env = wrappers.RecordEpisodeStatistics(env)

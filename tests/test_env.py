@@ -1,6 +1,8 @@
 """env.py on real PyBullet environments and on toys with known rewards; replay by exhaustion."""
 
 import gc
+import subprocess
+import sys
 import time
 
 import gymnasium as gym
@@ -11,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+import env as env_module
 from env import Replay, coverage, make_env, resize
 
 IDS = [f"{robot}BulletEnv-v0" for robot in ("Hopper", "Walker2D", "HalfCheetah", "Ant")]
@@ -217,6 +220,40 @@ def test_environment_without_images_is_refused(register):
 
 def test_environment_whose_renderer_is_missing_is_refused(register):
     assert "pygame" in refusal(register(MissingRenderer))
+
+
+# --- several PyBullet environments in one process ---
+
+
+def test_environment_made_after_another_was_dropped_or_closed_works():
+    """In a process of its own: this one holds others open, which hides it. Nor is anything printed,
+    be it at the end, when C empties its buffers into a pipe, or with its streams closed."""
+    code = """
+import gc
+import subprocess
+import sys
+from env import make_env
+for close in (True, False, False):
+    env = make_env("HopperBulletEnv-v0")
+    env.reset(seed=0)
+    env.step([0, 0, 0])
+    if close:
+        env.close()
+    del env
+    gc.collect()
+"""
+    for closed in ("", "import os; os.close(1); os.close(2); os.close(0)"):
+        command = [sys.executable, "-c", closed + code]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_silence_covers_both_streams_and_ends_after_an_error(capfd):
+    with pytest.raises(KeyError), env_module.silence():
+        subprocess.run("echo out; echo err >&2", shell=True)
+        raise KeyError
+    subprocess.run("echo out after; echo err after >&2", shell=True)
+    assert capfd.readouterr() == ("out after\n", "err after\n")
 
 
 # --- replay ---
