@@ -9,7 +9,11 @@ termination received with it.
 import contextlib
 import ctypes
 import difflib
+import importlib
+import numbers
 import os
+import traceback
+import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -19,6 +23,7 @@ from scipy.spatial import KDTree
 from scipy.special import digamma, gammaln
 
 IMAGE_SIZE = 64
+MAX_REWARD = 1e9  # of one environment step; more is a fault of the environment, not a reward
 MAX_STATES, MAX_DIMENSIONS = 5000, 64  # of `coverage`: a second
 
 
@@ -45,72 +50,92 @@ with silence():
     pybullet.connect(pybullet.DIRECT)
 
 
+class EnvironmentFault(RuntimeError):
+    """An environment raised or gave what cannot be learnt from: which and what, in one line."""
+
+
+@contextlib.contextmanager
+def blame(env_id: str, when: str = ""):
+    """Makes an `EnvironmentFault` of whatever foreign code raises. Ctrl-C passes."""
+    try:
+        yield
+    except (Exception, SystemExit) as error:
+        what = str(error)
+        if not isinstance(error, EnvironmentFault):
+            what = "raised " + "".join(traceback.format_exception_only(error)).rstrip(" .\n")
+            what += "," if when else ""
+        raise EnvironmentFault(" ".join(f"{env_id} {what} {when}".split()) + ".") from error
+
+
 def make_env(env_id: str, action_repeat: int = 2, camera_distance: float | None = None) -> gym.Env:
     """An environment whose observation is its 64×64×3 uint8 image and whose actions lie in [−1, 1].
 
     Each action is repeated, its rewards summed, up to the end of the episode; `terminated` and
-    `truncated` stay apart. A step's info["state"] is the environment's own observation, which the
-    agent never sees; the last step's info["episode"] holds return "r" and length "l" in environment
-    steps.
+    `truncated` stay apart. info["state"] is what the agent never sees, see `Foreign`; the last
+    step's info["episode"] holds return "r" and length "l" in environment steps;
+    metadata["render_fps"] counts decisions. What the environment does wrong later is raised as
+    `EnvironmentFault`.
 
     Args:
-        env_id: any registered environment with bounded `Box` actions that renders `rgb_array`.
+        env_id: any environment with bounded `Box` actions that renders `rgb_array`, by its
+            registered name, or as module:name where the module registers it.
         action_repeat: environment steps per decision.
-        camera_distance: metres from the camera to a PyBullet robot (None: the environment's own);
-            nothing elsewhere.
+        camera_distance: see `set_up_pybullet`; nothing elsewhere.
 
     Raises:
         ValueError: in one sentence, what is wrong with `env_id` and what to do.
     """
-    spec = find_spec(env_id)
     env = None
     try:
-        env = gym.make(spec, render_mode="rgb_array", disable_env_checker=True)
-        space = env.action_space
-        if not (isinstance(space, gym.spaces.Box) and space.is_bounded() and len(space.shape) == 1):
-            raise ValueError(f"its actions are {space}, not a bounded Box of one dimension")
-        if hasattr(env.unwrapped, "_render_width"):  # PyBullet: never resized from 320×240
-            env.unwrapped._render_width = env.unwrapped._render_height = IMAGE_SIZE
-            if camera_distance is not None:
-                env.unwrapped._cam_dist = camera_distance
-        # PyBullet loads its world at the first reset and restores it at later ones, with other
-        # contacts: after this one, an episode is a function of its seed and actions alone, in this
-        # process or in one that resumes it.
-        with silence():
-            env.reset(seed=0)
-        if not isinstance(env.render(), np.ndarray):
-            raise ValueError("it renders no images")
+        spec = find_spec(env_id)
+        # What it declares may be wrong, and is warned of; what counts is what it does.
+        with blame(env_id), warnings.catch_warnings(action="ignore"):
+            env = gym.make(spec, render_mode="rgb_array", disable_env_checker=True)
+        env = Foreign(env, camera_distance)
         env = wrappers.RecordEpisodeStatistics(env)
-        env = StateInInfo(env)
-        env = wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
         env = wrappers.RepeatAction(env, action_repeat)
         env = wrappers.AddRenderObservation(env)
-    except Exception as error:  # whatever a foreign environment raises, a missing library above all
-        if env is not None:
+        env.metadata = env.metadata | {"render_fps": env.metadata["render_fps"] / action_repeat}
+        return env
+    except Exception as error:
+        with contextlib.suppress(Exception):  # it may be None, or no better at closing
             env.close()
-        raise ValueError(f"{env_id} cannot be learnt from its images: {error}.") from error
-    if env.observation_space.shape != (IMAGE_SIZE, IMAGE_SIZE, 3):
-        space = gym.spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
-        env = wrappers.TransformObservation(env, resize, space)
-    return env
+        raise ValueError(f"{env_id} cannot be learnt from its images: {error}") from error
 
 
 def find_spec(env_id: str) -> gym.envs.registration.EnvSpec:
-    """The registered environment of that name.
+    """The environment of that name, after the import of the module before its colon, if any.
 
     Raises:
-        ValueError: in one sentence, with those of a similar name.
+        EnvironmentFault: if there is none, with those of a similar name.
     """
+    module, colon, name = env_id.rpartition(":")
+    if colon:
+        with blame(env_id):
+            importlib.import_module(module)
     try:
-        return gym.spec(env_id)
+        return gym.spec(name)
     except gym.error.Error:
-        close = difflib.get_close_matches(env_id, gym.registry, n=3, cutoff=0.5)
-        hint = (
-            f"did you mean {' or '.join(close)}?"
-            if close
-            else "gymnasium.pprint_registry() lists all."
-        )
-        raise ValueError(f"There is no environment {env_id!r}: {hint}") from None
+        close = difflib.get_close_matches(name, gym.registry, n=3, cutoff=0.5)
+        close = " or ".join(module + colon + other for other in close)
+        hint = f"did you mean {close}?" if close else "gymnasium.pprint_registry() lists all."
+        raise EnvironmentFault(f"there is no environment of that name, {hint}") from None
+
+
+def set_up_pybullet(robot: gym.Env, camera_distance: float | None) -> None:
+    """Loads a PyBullet robot's world.
+
+    Args:
+        camera_distance: metres from the camera to the robot (None: the environment's own).
+    """
+    robot._render_width = robot._render_height = IMAGE_SIZE  # never resized from 320×240
+    if camera_distance is not None:
+        robot._cam_dist = camera_distance
+    # Its world is loaded at the first reset and restored at later ones, with other contacts: after
+    # this one, an episode is a function of its seed and actions alone, in this process or in one
+    # that resumes it.
+    with silence():
+        robot.reset(seed=0)
 
 
 def resize(image: np.ndarray) -> np.ndarray:
@@ -118,12 +143,104 @@ def resize(image: np.ndarray) -> np.ndarray:
     return np.asarray(Image.fromarray(image).resize((IMAGE_SIZE, IMAGE_SIZE), Image.Resampling.BOX))
 
 
-class StateInInfo(gym.Wrapper):
-    """Keeps the environment's own observation in `info`, for `coverage`."""
+def to_pixels(image) -> np.ndarray:
+    """A new (64, 64, 3) uint8 image of one that is grey, RGB or RGBA (alpha is dropped).
+
+    Raises:
+        EnvironmentFault: for what is neither bool, nor integers in 0 … 255, nor floats in 0 … 1.
+    """
+    image = np.asarray(image)
+    image = image[..., None] if image.ndim == 2 else image
+    white = 255 if image.dtype.kind in "iu" else 1
+    known = image.dtype.kind in "biuf" and image.ndim == 3 and image.shape[2] in (1, 3, 4)
+    # A float that is white but for its rounding is white.
+    if not (known and image.size and -1e-3 < image.min() and image.max() < white + 1e-3):
+        raise EnvironmentFault(
+            f"rendered {image.dtype} of shape {image.shape}, no grey, RGB or RGBA image of "
+            "integers from 0 to 255 or floats from 0 to 1,"
+        )
+    if white == 1:
+        image = np.rint(image * 255.0)
+    return resize(np.broadcast_to(image[..., :3].astype(np.uint8), (*image.shape[:2], 3)))
+
+
+class Foreign(gym.Wrapper, gym.utils.RecordConstructorArgs):
+    """The door to somebody else's environment: what comes in is copied, checked, and converted if
+    it has one meaning; what goes out, an action in [−1, 1], is mapped into the environment's box.
+
+    It begins with a reset, an image and a step, so that what is wrong shows at once. info["state"]
+    is the environment's own observation as a new float64 vector of constant size: nan where it is
+    not what its space says; empty if it has more than 64 numbers, or no fixed number of them.
+
+    Raises:
+        EnvironmentFault: in all methods, for whatever the environment does.
+    """
+
+    render_mode = "rgb_array"
+
+    def __init__(self, env, camera_distance=None):
+        gym.utils.RecordConstructorArgs.__init__(self, camera_distance=camera_distance)
+        super().__init__(env)
+        self.name, self.age, self.state_size = env.spec.id, 0, 0  # age: steps of the episode
+        with blame(self.name):
+            self.box = box = env.action_space
+            bounded = isinstance(box, gym.spaces.Box) and box.is_bounded()
+            if not (bounded and len(box.shape) == 1 and box.shape[0] > 0):
+                raise EnvironmentFault(f"has the actions {box}, not a bounded Box of one dimension")
+            self.action_space = gym.spaces.Box(-1, 1, box.shape, np.float32)
+            fps = env.metadata.get("render_fps")
+            fps = fps if isinstance(fps, numbers.Real) and 0 < fps < np.inf else 30  # as most do
+            self.metadata = {"render_modes": ["rgb_array"], "render_fps": fps}
+            with contextlib.suppress(Exception):  # a sequence, a graph, one of its own
+                size = gym.spaces.flatdim(env.observation_space)
+                self.state_size = size if size <= MAX_DIMENSIONS else 0
+            if hasattr(env.unwrapped, "_render_width"):
+                set_up_pybullet(env.unwrapped, camera_distance)
+        self.reset(seed=0)
+        self.render()
+        self.step(np.zeros(box.shape, np.float32))
+
+    def reset(self, *, seed=None, options=None):
+        self.age = 0
+        with blame(self.name, "at its reset"):
+            return self.accept(self.env.reset(seed=seed, options=options), "observation, info")
 
     def step(self, action):
-        state, reward, terminated, truncated, info = self.env.step(action)
-        return state, reward, terminated, truncated, info | {"state": np.ravel(state)}
+        self.age += 1
+        # In longdouble, the one float that holds every int64; halved first, no sum overflows.
+        low, high = self.box.low.astype(np.longdouble), self.box.high.astype(np.longdouble)
+        value = np.clip(low / 2 + high / 2 + (high / 2 - low / 2) * action, low, high)
+        value = value if self.box.dtype.kind == "f" else np.rint(value)
+        with blame(self.name, f"at its step {self.age}"):
+            result = self.env.step(value.astype(self.box.dtype))
+            names = "observation, reward, terminated, truncated, info"
+            state, reward, terminated, truncated, info = self.accept(result, names)
+            number = np.asarray(reward)
+            one = number.size == 1 and number.dtype.kind in "biuf"
+            if not (one and -MAX_REWARD <= number.item() <= MAX_REWARD):
+                raise EnvironmentFault(f"gave the reward {reward}")
+            return state, float(number.item()), bool(terminated), bool(truncated), info
+
+    def render(self):
+        with blame(self.name, f"after its step {self.age}"):
+            return to_pixels(self.env.render())
+
+    def close(self):
+        with contextlib.suppress(Exception):  # all that it was wanted for is done
+            self.env.close()
+
+    def accept(self, result, names: str) -> tuple:
+        """What `reset` or `step` returned, with the state in `info`."""
+        whole = isinstance(result, tuple) and len(result) == len(names.split())
+        if not (whole and isinstance(result[-1], dict)):
+            raise EnvironmentFault(f"did not return ({names}) with a dict for info")
+        state = np.full(self.state_size, np.nan)
+        if self.state_size:
+            with contextlib.suppress(Exception):  # what only measures never stops a run
+                state[:] = gym.spaces.flatten(self.env.observation_space, result[0])
+        # RecordEpisodeStatistics, next to come, asserts that there is no other "episode".
+        info = {k: v for k, v in result[-1].items() if k not in ("episode", "_episode")}
+        return *result[:-1], info | {"state": state}
 
 
 def coverage(states: np.ndarray, k: int = 3) -> float:

@@ -8,13 +8,15 @@ import time
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium import spaces
 from gymnasium.spaces import Box
+from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
 import env as env_module
-from env import Replay, coverage, make_env, resize
+from env import EnvironmentFault, Replay, coverage, make_env, resize
 
 IDS = [f"{robot}BulletEnv-v0" for robot in ("Hopper", "Walker2D", "HalfCheetah", "Ant")]
 
@@ -40,6 +42,44 @@ class Toy(gym.Env):
 
     def render(self):
         return np.zeros((64, 64, 3), np.uint8) if self.image is None else self.image
+
+
+class Base(gym.Env):
+    """Somebody's environment, and whatever is `given` in the place of its own attributes."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
+    action_space = Box(-1, 1, (2,), np.float32)
+    observation_space = Box(-10, 10, (3,), np.float32)
+
+    def __init__(self, render_mode=None, **given):
+        self.render_mode, self.t, self.actions = render_mode, 0, []
+        for name, value in given.items():
+            setattr(self, name, value)
+
+    def obs(self):
+        return self.np_random.normal(size=3).astype(np.float32)
+
+    def image(self):
+        image = np.zeros((64, 64, 3), np.uint8)
+        image[self.t] = 255
+        return image
+
+    def outcome(self):
+        return self.obs(), 1.0, self.t >= 20, False, {}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return self.obs(), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action), f"{action!r} is not in {self.action_space}"
+        self.t += 1
+        self.actions.append(action)
+        return self.outcome()
+
+    def render(self):
+        return self.image()
 
 
 class NoRenderMode(Toy):
@@ -222,6 +262,315 @@ def test_environment_whose_renderer_is_missing_is_refused(register):
     assert "pygame" in refusal(register(MissingRenderer))
 
 
+# --- somebody's environment ---
+
+
+def test_arrays_that_an_environment_refills_are_copied_where_they_enter(make, register):
+    canvas, buffer = np.zeros((64, 64, 3), np.uint8), np.zeros(3, np.float32)
+
+    def image():
+        canvas[:] += 1
+        return canvas
+
+    def obs():
+        buffer[:] += 1
+        return buffer
+
+    env = make(register(Base, image=image, obs=obs))
+    outcomes = [env.step(np.zeros(2, np.float32)) for _ in range(3)]
+    assert np.diff([outcome[0].mean() for outcome in outcomes]).tolist() == [1, 1]
+    assert np.diff([outcome[4]["state"][0] for outcome in outcomes]).tolist() == [2, 2]
+
+
+GREY = np.random.default_rng(0).integers(256, size=(64, 64), dtype=np.uint8)
+RGB = np.random.default_rng(1).integers(256, size=(64, 64, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize(
+    "given, seen",
+    [
+        (RGB / 255, RGB),
+        ((RGB / 255).astype(np.float32), RGB),
+        (RGB.astype(np.int64), RGB),
+        (RGB > 99, 255 * (RGB > 99)),
+        (np.dstack([RGB, GREY]), RGB),
+        (np.dstack([RGB, GREY]) / 255, RGB),
+        (GREY, np.dstack([GREY] * 3)),
+        (GREY[..., None], np.dstack([GREY] * 3)),
+        (np.full((64, 64, 3), 1 + 1e-7), np.full((64, 64, 3), 255)),
+        (RGB[::-1].repeat(2, 0), RGB[::-1]),
+    ],
+)
+def test_image_with_one_meaning_is_seen_as_it_is_meant(make, register, given, seen):
+    env = make(register(Base, image=lambda: given))
+    image, _ = env.reset()
+    assert image.dtype == np.uint8 and np.array_equal(image, seen)
+    assert np.array_equal(env.step(np.zeros(2, np.float32))[0], seen)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        RGB.astype(np.float32),
+        RGB / 255 - 0.5,
+        RGB.astype(np.int16) * 2,
+        np.full((64, 64, 3), np.nan),
+        np.moveaxis(RGB, 2, 0),
+        RGB[..., :2],
+        RGB[None],
+        RGB[:0],
+        RGB * 1j,
+        "text",
+        None,
+        [RGB, RGB[:3]],
+    ],
+    ids=lambda image: f"{type(image).__name__}{np.shape(image) if type(image) is not list else ''}",
+)
+def test_image_without_one_meaning_is_refused(register, image):
+    assert "image" in refusal(register(Base, image=lambda: image))
+
+
+def test_image_of_another_size_each_time_is_resized_each_time(make, register):
+    sizes = iter([(64, 64), (10, 20), (300, 65), (64, 64), (1, 1), (128, 64)])
+    env = make(register(Base, image=lambda: np.full((*next(sizes), 3), 7, np.uint8)))
+    images = [env.reset()[0], *(env.step(np.zeros(2, np.float32))[0] for _ in range(3))]
+    assert all(image.shape == (64, 64, 3) and (image == 7).all() for image in images)
+
+
+@pytest.mark.parametrize(
+    "reward", [2, True, np.float32(0.5), np.array(3), np.array([1.0]), np.array([[2]]), [1.5]]
+)
+def test_reward_that_is_one_number_becomes_a_float(make, register, reward):
+    one = make(register(Base, outcome=lambda: (np.zeros(3), reward, 0, np.True_, {})))
+    one.reset()
+    _, given, terminated, truncated, info = one.step(np.zeros(2, np.float32))
+    assert type(given) is float and given == np.ravel(reward)[0]
+    assert terminated is False and truncated is True
+    assert info["episode"]["r"] == given and type(info["episode"]["r"]) is float
+
+
+@pytest.mark.parametrize("reward", [np.ones(2), None, "1", 1j, {}, np.nan, -np.inf, 1e30, -(2**63)])
+def test_reward_that_is_no_reasonable_number_is_refused(register, reward):
+    outcome = np.zeros(3), reward, False, False, {}
+    assert "gave the reward" in refusal(register(Base, outcome=lambda: outcome))
+
+
+def test_environments_own_episode_in_info_gives_way_and_the_rest_of_it_stays(make, register):
+    info = {"episode": {"r": 7}, "_episode": True, "success": 1}
+    env = make(register(Base, outcome=lambda: (np.zeros(3), 1.0, True, False, dict(info))))
+    env.reset()
+    told = env.step(np.zeros(2, np.float32))[4]
+    assert told["episode"]["r"] == 1 and told["success"] == 1 and "_episode" not in told
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"outcome": lambda: (np.zeros(3), 1.0, False, {})},
+        {"outcome": lambda: (np.zeros(3), 1.0, False, False, None)},
+        {"outcome": lambda: np.zeros(5)},
+        {"outcome": lambda: None},
+        {"reset": lambda seed=None, options=None: np.zeros(3)},
+        {"reset": lambda seed=None, options=None: np.zeros(2)},
+        {"reset": lambda seed=None, options=None: (np.zeros(3), [])},
+        {"reset": lambda: (np.zeros(3), {})},
+        {"render": lambda: 1 / 0},
+        {"outcome": sys.exit},
+        {"obs": lambda: [][0]},
+        {"outcome": lambda: exec("raise ValueError('two\\nlines')")},
+        {"action_space": None},
+        {"metadata": None},
+        {"action_space": Box(-1, 1, (0,))},
+        {"nowhere": 1, "render_mode": None, "render": None},
+    ],
+)
+def test_what_is_no_gymnasium_environment_is_refused_in_one_sentence(register, given):
+    refusal(register(Base, **given))
+
+
+def test_interrupt_while_an_environment_is_made_passes(register):
+    def interrupt():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make_env(register(Base, render=interrupt))
+
+
+def give_or_raise(value):
+    if isinstance(value, BaseException):
+        raise value
+    return value
+
+
+@pytest.mark.parametrize(
+    "name, later, words",
+    [
+        ("image", ZeroDivisionError("a\nb"), "raised ZeroDivisionError: a b"),
+        ("image", RGB.astype(np.float32), "rendered float32"),
+        ("image", RGB[..., :2], r"\(64, 64, 2\)"),
+        ("obs", AssertionError(), "raised AssertionError"),
+        ("obs", SystemExit(3), "raised SystemExit: 3"),
+        ("outcome", (np.zeros(3), np.nan, False, False, {}), "gave the reward nan at its step 3"),
+        ("outcome", (np.zeros(3), -2e9, False, False, {}), "gave the reward -2000000000.0"),
+        ("outcome", (np.zeros(3), np.ones(2), False, False, {}), "gave the reward"),
+        ("outcome", (np.zeros(3), 1.0, False, {}), "did not return"),
+        ("outcome", (np.zeros(3), 1.0, np.ones(2, bool), False, {}), "raised ValueError"),
+    ],
+)
+def test_what_goes_wrong_later_is_one_kind_of_fault_in_one_line(make, register, name, later, words):
+    env_id = register(Base)
+    env = make(env_id, action_repeat=1)
+    env.reset(seed=0)
+    for _ in range(2):
+        env.step(np.zeros(2, np.float32))
+    setattr(env.unwrapped, name, lambda: give_or_raise(later))
+    with pytest.raises(EnvironmentFault, match=words) as fault:
+        env.step(np.zeros(2, np.float32))
+    assert env_id in str(fault.value) and "\n" not in str(fault.value)
+    if name == "obs":
+        with pytest.raises(EnvironmentFault, match=words):
+            env.reset()
+
+
+@pytest.mark.parametrize(
+    "box",
+    [
+        Box(0, 10, (2,), np.int64),
+        Box(-3, 3, (2,), np.int8),
+        Box(0, 2**64 - 1, (2,), np.uint64),
+        Box(np.array([-1, 0], "f4"), np.array([1, 0], "f4")),
+        Box(5, 5, (2,), np.int32),
+        Box(np.float32(-0.1), np.float32(0.7), (2,), np.float32),
+        Box(np.float32(0.1), np.float32(0.3), (2,), np.float32),
+        Box(-1.7e308, 1.7e308, (2,), np.float64),
+        Box(-0.1, 0.7, (2,), np.float64),
+        Box(np.float16(-0.1), np.float16(0.7), (2,), np.float16),
+    ],
+    ids=str,
+)
+def test_action_that_arrives_lies_in_the_environments_box_and_is_linear_in_ours(
+    make, register, box
+):
+    env = make(register(Base, action_space=box), action_repeat=1)
+    assert env.action_space == Box(-1, 1, (2,), np.float32)
+    env.reset()
+    ours = np.concatenate([[-1, 0, 1, 1.5, -0.3], np.random.default_rng(0).uniform(-1, 1, 14)])
+    for a in ours:  # `Base.step` asserts that it lies in the box
+        env.step(np.full(2, a, np.float32))
+    arrived = np.array(env.unwrapped.actions[1:], np.longdouble)
+    assert np.isfinite(arrived).all()
+    assert (arrived[0] == box.low).all() and (arrived[[2, 3]] == box.high).all()
+    low, high = box.low.astype(np.longdouble), box.high.astype(np.longdouble)
+    share = (np.clip(ours, -1, 1).astype("f4").astype(np.longdouble)[:, None] + 1) / 2
+    exact = low * (1 - share) + high * share
+    within = 0.5 if box.dtype.kind in "iu" else np.abs(high).max() * np.finfo(box.dtype).eps
+    assert (np.abs(arrived - exact) <= within * (1 + 1e-9)).all()
+
+
+OWN = {
+    "box": (Box(-9, 9, (2, 3)), np.arange(6).reshape(2, 3), range(6)),
+    "discrete": (spaces.Discrete(3), 1, [0, 1, 0]),
+    "dict": (
+        spaces.Dict({"b": Box(0, 9, (2,)), "a": spaces.Tuple([spaces.Discrete(2)])}),
+        {"a": (1,), "b": np.array([5, 6])},
+        [0, 1, 5, 6],
+    ),
+    "not what it says": (Box(-9, 9, (3,)), [[1, 2], [3]], [np.nan] * 3),
+    "too long": (Box(-9, 9, (3,)), np.zeros(4), [np.nan] * 3),
+    "not finite": (Box(-9, 9, (2,)), np.array([np.inf, 1]), [np.inf, 1]),
+    "sequence": (spaces.Sequence(Box(0, 1, (2,))), (), []),
+    "graph": (spaces.Graph(Box(0, 1, (2,)), None), None, []),
+    "long text": (spaces.Text(99), "abc", []),
+    "image": (Box(0, 255, (96, 96, 3), np.uint8), np.zeros((96, 96, 3), np.uint8), []),
+    "much": (spaces.Discrete(10**15), 1, []),
+    "of its own": (None, "?", []),
+}
+
+
+@pytest.mark.parametrize("space, own, flat", OWN.values(), ids=OWN)
+def test_environments_own_state_is_a_vector_of_numbers_or_empty(make, register, space, own, flat):
+    env = make(register(Base, observation_space=space, obs=lambda: own))
+    infos = [env.reset()[1], *(env.step(np.zeros(2, np.float32))[4] for _ in range(5))]
+    states = np.stack([info["state"] for info in infos])
+    assert states.dtype == np.float64 and states.shape == (6, len(flat))
+    np.testing.assert_array_equal(states[-1], list(flat))
+    assert np.isfinite(coverage(states)) == bool(np.isfinite(list(flat)).all() and len(flat))
+
+
+@pytest.mark.parametrize("space", [spaces.Text(5), Box(-10, 10, (3,), np.float32)])
+def test_nothing_that_an_environment_observes_stops_an_episode(make, register, space):
+    for own in ("abc", "§", "much too long", None, 3, [[1], [2, 3]], object()):
+        env = make(register(Base, observation_space=space, obs=lambda own=own: own))
+        _, rewards, terminated, *_ = play(env, 0, np.zeros((20, 2), np.float32))
+        assert terminated and rewards.sum() == 20
+
+
+def test_environment_that_says_nothing_of_its_rendering_is_taken_for_what_it_does(make, register):
+    for metadata in ({}, {"render_modes": ["human"], "render_fps": None}, {"render_fps": "fast"}):
+
+        class Silent(Base):
+            def __init__(self, render_mode=None):
+                pass  # nor does it keep its render mode
+
+            t = 0
+
+            def step(self, action):
+                return np.zeros(3), 0.0, False, False, {}
+
+        Silent.metadata = metadata
+        env = make(register(Silent))
+        assert env.reset()[0][0].max() == 255
+        assert env.metadata["render_fps"] == 15
+
+
+def test_render_fps_counts_decisions(make, register):
+    assert make(register(Base), action_repeat=3).metadata["render_fps"] == 10
+    assert make(IDS[0], action_repeat=2).metadata["render_fps"] == 30
+
+
+def test_environment_that_fails_to_close_is_closed(register):
+    env = make_env(register(Base, close=lambda: 1 / 0))
+    env.close()
+    refusal(register(Base, close=lambda: 1 / 0, render=lambda: None))
+
+
+def test_seed_reaches_the_environment_as_it_is_given(make, register):
+    class Seeded(Base):
+        def reset(self, *, seed=None, options=None):
+            self.seed, self.options = seed, options
+            return super().reset(seed=seed)
+
+    env = make(register(Seeded))
+    env.reset(seed=2**31 - 1, options={"a": 1})
+    assert (env.unwrapped.seed, env.unwrapped.options) == (2**31 - 1, {"a": 1})
+
+
+@pytest.mark.filterwarnings("ignore")  # that it has wrappers
+@pytest.mark.parametrize("env_id", [*IDS, "Pendulum-v1"])
+def test_gymnasiums_own_check_passes(make, env_id):
+    if env_id == "Pendulum-v1":
+        pytest.importorskip("pygame")
+    env = make(env_id)
+    assert env.spec.id == env_id
+    check_env(env)
+
+
+def test_environment_is_imported_from_the_module_before_its_colon(make, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    register = f"import gymnasium\ngymnasium.register('Mine-v0', '{__name__}:Base')\n"
+    (tmp_path / "mine_of_test.py").write_text(register)
+    (tmp_path / "broken_of_test.py").write_text("raise SystemExit('two\\nlines')\n")
+    try:
+        assert make("mine_of_test:Mine-v0").reset()[0].shape == (64, 64, 3)
+        assert "did you mean mine_of_test:Mine-v0" in refusal("mine_of_test:Mine-v1")
+    finally:
+        del gym.registry["Mine-v0"]
+    assert "No module named 'nowhere'" in refusal("nowhere:Mine-v0")
+    assert "SystemExit" in refusal("broken_of_test:Mine-v0")
+    for malformed in (":", ":Mine-v0", "a:b:Mine-v0", ".a:Mine-v0", "mine_of_test:", "", "a/b/c"):
+        refusal(malformed)
+
+
 # --- several PyBullet environments in one process ---
 
 
@@ -230,8 +579,6 @@ def test_environment_made_after_another_was_dropped_or_closed_works():
     be it at the end, when C empties its buffers into a pipe, or with its streams closed."""
     code = """
 import gc
-import subprocess
-import sys
 from env import make_env
 for close in (True, False, False):
     env = make_env("HopperBulletEnv-v0")
