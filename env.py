@@ -67,7 +67,12 @@ def blame(env_id: str, when: str = ""):
         raise EnvironmentFault(" ".join(f"{env_id} {what} {when}".split()) + ".") from error
 
 
-def make_env(env_id: str, action_repeat: int = 2, camera_distance: float | None = None) -> gym.Env:
+def make_env(
+    env_id: str,
+    action_repeat: int = 2,
+    camera_distance: float | None = None,
+    floor_brightness: float = 1.0,
+) -> gym.Env:
     """An environment whose observation is its 64×64×3 uint8 image and whose actions lie in [−1, 1].
 
     Each action is repeated, its rewards summed, up to the end of the episode; `terminated` and
@@ -80,7 +85,7 @@ def make_env(env_id: str, action_repeat: int = 2, camera_distance: float | None 
         env_id: any environment with bounded `Box` actions that renders `rgb_array`, by its
             registered name, or as module:name where the module registers it.
         action_repeat: environment steps per decision.
-        camera_distance: see `set_up_pybullet`; nothing elsewhere.
+        camera_distance, floor_brightness: see `set_up_pybullet`; nothing elsewhere.
 
     Raises:
         ValueError: in one sentence, what is wrong with `env_id` and what to do.
@@ -91,7 +96,7 @@ def make_env(env_id: str, action_repeat: int = 2, camera_distance: float | None 
         # What it declares may be wrong, and is warned of; what counts is what it does.
         with blame(env_id), warnings.catch_warnings(action="ignore"):
             env = gym.make(spec, render_mode="rgb_array", disable_env_checker=True)
-        env = Foreign(env, camera_distance)
+        env = Foreign(env, camera_distance, floor_brightness)
         env = wrappers.RecordEpisodeStatistics(env)
         env = wrappers.RepeatAction(env, action_repeat)
         env = wrappers.AddRenderObservation(env)
@@ -122,11 +127,13 @@ def find_spec(env_id: str) -> gym.envs.registration.EnvSpec:
         raise EnvironmentFault(f"there is no environment of that name, {hint}") from None
 
 
-def set_up_pybullet(robot: gym.Env, camera_distance: float | None) -> None:
+def set_up_pybullet(robot: gym.Env, camera_distance: float | None, floor_brightness: float) -> None:
     """Loads a PyBullet robot's world.
 
     Args:
         camera_distance: metres from the camera to the robot (None: the environment's own).
+        floor_brightness: factor on the floor's texture. Its bright checkerboard is most of the
+            image loss, yet the only cue of forward speed: dim it, but leave it to be seen.
     """
     robot._render_width = robot._render_height = IMAGE_SIZE  # never resized from 320×240
     if camera_distance is not None:
@@ -136,6 +143,13 @@ def set_up_pybullet(robot: gym.Env, camera_distance: float | None) -> None:
     # that resumes it.
     with silence():
         robot.reset(seed=0)
+    for i in range(robot._p.getNumBodies() if floor_brightness != 1.0 else 0):
+        body = robot._p.getBodyUniqueId(i)
+        name = b" ".join(robot._p.getBodyInfo(body)).lower()
+        if any(word in name for word in (b"floor", b"plane", b"stadium")):
+            for _, link, *_, (*rgb, alpha) in robot._p.getVisualShapeData(body):
+                colour = [*np.multiply(rgb, floor_brightness), alpha]
+                robot._p.changeVisualShape(body, link, rgbaColor=colour)
 
 
 def resize(image: np.ndarray) -> np.ndarray:
@@ -178,8 +192,9 @@ class Foreign(gym.Wrapper, gym.utils.RecordConstructorArgs):
 
     render_mode = "rgb_array"
 
-    def __init__(self, env, camera_distance=None):
-        gym.utils.RecordConstructorArgs.__init__(self, camera_distance=camera_distance)
+    def __init__(self, env, camera_distance=None, floor_brightness=1.0):
+        settings = {"camera_distance": camera_distance, "floor_brightness": floor_brightness}
+        gym.utils.RecordConstructorArgs.__init__(self, **settings)
         super().__init__(env)
         self.name, self.age, self.state_size = env.spec.id, 0, 0  # age: steps of the episode
         with blame(self.name):
@@ -195,7 +210,7 @@ class Foreign(gym.Wrapper, gym.utils.RecordConstructorArgs):
                 size = gym.spaces.flatdim(env.observation_space)
                 self.state_size = size if size <= MAX_DIMENSIONS else 0
             if hasattr(env.unwrapped, "_render_width"):
-                set_up_pybullet(env.unwrapped, camera_distance)
+                set_up_pybullet(env.unwrapped, **settings)
         self.reset(seed=0)
         self.render()
         self.step(np.zeros(box.shape, np.float32))

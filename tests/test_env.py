@@ -603,6 +603,25 @@ def test_silence_covers_both_streams_and_ends_after_an_error(capfd):
     assert capfd.readouterr() == ("out after\n", "err after\n")
 
 
+@pytest.mark.parametrize("env_id", IDS)
+def test_floor_brightness_dims_the_floor_and_leaves_its_texture(make, env_id):
+    """The floor is what changes. Of its brightness and contrast, the part asked for is left."""
+    own, untouched, dim = make(env_id), *(make(env_id, floor_brightness=f) for f in (1.0, 0.4))
+    actions = random_actions(own, 8)
+    images, rewards, *_ = play(own, 3, actions)
+    same, *_ = play(untouched, 3, actions)
+    dimmed, same_rewards, *_ = play(dim, 3, actions)
+    dimmed_again, *_ = play(dim, 3, actions)
+    assert np.array_equal(images, same)
+    assert np.array_equal(dimmed, dimmed_again)  # resets leave it
+    assert rewards.tolist() == same_rewards.tolist()
+    floor = (images != dimmed).any(-1)
+    assert floor.mean() > 0.2
+    assert dimmed[floor].mean() == pytest.approx(0.4 * images[floor].mean(), rel=0.1)
+    assert dimmed[floor].std() == pytest.approx(0.4 * images[floor].std(), rel=0.1)
+    assert np.array_equal(images[~floor], dimmed[~floor])
+
+
 # --- replay ---
 
 
