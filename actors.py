@@ -1,4 +1,4 @@
-"""Actors, critics and exploration: §2.2, §4.1 and the minor modifications 1, 2 and 4 of §4.2.
+"""Actors, critics, exploration and acting: §2.2, §4.1, minor modifications 1, 2 and 4 of §4.2.
 
 The stochastic actor maximises the λ-return plus β times the entropy of the states it will visit;
 the deterministic actor, trained beside it, maximises the λ-return alone (Eq. 7). Each has its own
@@ -8,7 +8,8 @@ steps, N sequences, D state, A action.
 """
 
 import math
-from itertools import pairwise
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,39 +18,30 @@ from torch import Tensor, nn
 from torch.distributions import Normal
 
 from returns import lambda_return, survival
-
-
-class Float32Linear(nn.Linear):
-    """A linear layer that autocast leaves alone: in bfloat16's 8 bits a value of 150.3 is 150."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        with torch.autocast(x.device.type, enabled=False):
-            return super().forward(x.float())
-
-
-def mlp(inputs: int, units: int, layers: int, outputs: int) -> nn.Sequential:
-    """`layers` hidden ELU layers of `units`, then a linear one, as in Dreamer."""
-    sizes = [inputs] + [units] * layers
-    hidden = [m for i, o in pairwise(sizes) for m in (nn.Linear(i, o), nn.ELU(inplace=True))]
-    return nn.Sequential(*hidden, Float32Linear(sizes[-1], outputs))
+from world_model import mlp
 
 
 class StochasticActor(nn.Module):
     """π(a | s) = tanh(Normal(μ, σ)), as in Dreamer.
 
-        μ = 5 tanh(x / 5),   σ = softplus(y + log(e⁵ − 1)) + 1e-4
+        μ = 5 tanh(x / 5),   σ = softplus(y + log(e⁵ − 1)) + min_std
 
-    σ is near 5 at first: the untrained policy plays all actions, mostly the extreme ones.
+    σ is near 5 at first: the untrained policy plays all actions, mostly the extreme ones. min_std
+    is 1e-4 in Dreamer; a larger one keeps an explorer from becoming a deterministic actor.
     """
 
-    def __init__(self, size: int, actions: int, units: int, layers: int = 4):
+    def __init__(self, size: int, actions: int, units: int, layers: int = 4, min_std: float = 1e-4):
         super().__init__()
-        self.net = mlp(size, units, layers, 2 * actions)
+        self.net, self.min_std = mlp(size, units, layers, 2 * actions), min_std
+
+    def raw(self, state: Tensor) -> Tensor:
+        """x, what the bounds act on: (…, D) -> (…, A)."""
+        return self.net(state).chunk(2, -1)[0]
 
     def distribution(self, state: Tensor) -> Normal:
         """The distribution before the tanh, in float32: (…, D) -> Normal of (…, A)."""
         mean, std = self.net(state).chunk(2, -1)
-        std = F.softplus(std + math.log(math.exp(5) - 1)) + 1e-4
+        std = F.softplus(std + math.log(math.exp(5) - 1)) + self.min_std
         return Normal(5 * torch.tanh(mean / 5), std, validate_args=False)
 
     def forward(self, state: Tensor) -> Tensor:
@@ -68,9 +60,13 @@ class DeterministicActor(nn.Module):
         super().__init__()
         self.net = mlp(size, units, layers, actions)
 
+    def raw(self, state: Tensor) -> Tensor:
+        """x, what the bounds act on: (…, D) -> (…, A)."""
+        return self.net(state)
+
     def forward(self, state: Tensor) -> Tensor:
         """The action, in [−1, 1]: (…, D) -> (…, A)."""
-        return torch.tanh(5 * torch.tanh(self.net(state) / 5))
+        return torch.tanh(5 * torch.tanh(self.raw(state) / 5))
 
     mode = forward
 
@@ -155,3 +151,58 @@ def explore(
         return rng.uniform(-1, 1, action.shape).astype(np.float32)
     noisy = action + noise * rng.standard_normal(action.shape)
     return noisy.clip(-1, 1).astype(np.float32)
+
+
+@torch.no_grad()
+def act(
+    agent, policy: Callable, image: np.ndarray, action: np.ndarray, state: Tensor | None
+) -> tuple[np.ndarray, Tensor]:
+    """One decision from pixels: infer the state from the image and what came before it, then act.
+
+    Args:
+        agent: has the world model, `model`, and the `device` where it is.
+        policy: states (1, D) to actions (1, A).
+        image: (64, 64, 3) uint8.
+        action: (A,), the last one.
+        state: (1, D), the last one; None at the first image that is looked at.
+
+    Returns:
+        the action (A,) and the state (1, D).
+    """
+    rows = np.array(image), np.array(action), np.array(state is None)  # B = T = 1
+    rows = [torch.from_numpy(x)[None, None].to(agent.device) for x in rows]
+    # In float32: to cast all weights costs more than one image's products in bfloat16 save.
+    state = agent.model.observe(*rows, previous=state).state[:, 0]
+    return policy(state)[0].cpu().numpy(), state
+
+
+class Episode(NamedTuple):
+    """An episode of L decisions, played without learning from it."""
+
+    images: np.ndarray  # (L + 1, 64, 64, 3) uint8 o_0 … o_L
+    actions: np.ndarray  # (L, A) a_0 … a_{L−1}
+    rewards: np.ndarray  # (L,) r_1 … r_L
+    states: Tensor  # (L, D) s_0 … s_{L−1}
+    terminated: bool  # or cut off by a time limit
+    total: float  # sum of rewards
+    length: int  # environment steps
+
+
+def play(agent, env, policy: Callable, seed: int, most: int = 10_000) -> Episode:
+    """One episode of a policy, ended after `most` environment steps if it does not end before.
+    Training's random numbers stay as they were."""
+    image, _ = env.reset(seed=seed)
+    images, actions, states = [image], [np.zeros(env.action_space.shape, np.float32)], [None]
+    rewards, over, length = [], False, 0
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        while not over and length < most:
+            action, state = act(agent, policy, images[-1], actions[-1], states[-1])
+            image, reward, terminated, truncated, _ = env.step(action)
+            over, length = terminated or truncated, int(env.get_wrapper_attr("episode_lengths"))
+            images.append(image), actions.append(action), states.append(state)
+            rewards.append(reward)
+    return Episode(
+        np.array(images), np.array(actions[1:]), np.array(rewards), torch.cat(states[1:]),
+        bool(terminated), float(sum(rewards)), length,
+    )  # fmt: skip

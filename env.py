@@ -14,6 +14,8 @@ import numbers
 import os
 import traceback
 import warnings
+import zlib
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -293,50 +295,98 @@ def coverage(states: np.ndarray, k: int = 3) -> float:
 
 
 class Replay:
-    """A preallocated ring of rows of experience, sampled as windows of consecutive rows.
+    """A ring of rows of experience, sampled as windows of consecutive rows.
 
     A row is a record of image, action, reward, terminated and is_first: one array, one copy of each
-    observation.
+    observation. With a file, the array is that file, mapped: its memory is the page cache's.
 
     Args:
-        capacity: rows it holds; older ones are overwritten.
+        capacity: newest rows that are sampled; older ones are overwritten.
         actions: A.
+        path: the file; without one the rows are in memory alone.
+        reserve: rows beyond capacity that the ring holds: so many can be added before the newest
+            `capacity` of now are touched, and `restore` can go back to them.
     """
 
-    def __init__(self, capacity: int, actions: int):
-        row = np.dtype([
+    GROWTH = 64  # rows by which the file grows
+
+    def __init__(self, capacity: int, actions: int, path: Path | None = None, reserve: int = 0):
+        self.dtype = np.dtype([
             ("image", np.uint8, (IMAGE_SIZE, IMAGE_SIZE, 3)),
             ("action", np.float32, (actions,)),
             ("reward", np.float32),
             ("terminated", np.bool_),
             ("is_first", np.bool_),
         ], align=True)  # fmt: skip
-        self.rows = np.zeros(capacity, row)
-        self.added = 0  # rows ever added; row i lies at i % capacity
+        self.capacity, self.ring, self.path = capacity, capacity + reserve, path
+        self.rows = np.zeros(0 if path else self.ring, self.dtype)
+        self.checksums = np.zeros(self.ring, np.uint32)  # CRC-32 of each row
+        self.added = 0  # rows ever added; row i lies at i % ring
+        if path:
+            path.touch()
 
     def __len__(self) -> int:
-        return min(self.added, len(self.rows))
+        return min(self.added, self.capacity)
+
+    def grow(self) -> None:
+        """Make the file longer, with real zeros: a full disk says so here, as an OSError; written
+        to through the map, it would kill the process."""
+        with open(self.path, "ab") as file:
+            more = min(self.GROWTH, self.ring - len(self.rows))
+            file.truncate(self.rows.nbytes)
+            file.write(bytes(more * self.dtype.itemsize))
+        self.map_file()
+
+    def map_file(self) -> None:
+        """Take the file's rows for the array."""
+        self.file = np.memmap(self.path, np.uint8, "r+")
+        whole = len(self.file) // self.dtype.itemsize
+        self.rows = np.asarray(self.file)[: whole * self.dtype.itemsize].view(self.dtype)
 
     def add(self, image, action=0.0, reward=0.0, terminated=False, is_first=False) -> None:
-        """Append one row. A reset's has action and reward 0: `add(image, is_first=True)`."""
-        row = self.rows[self.added % len(self.rows)]
+        """Append one row. A reset's has action and reward 0: `add(image, is_first=True)`.
+
+        Raises:
+            OSError: if the disk is full.
+        """
+        at = self.added % self.ring
+        if at == len(self.rows):
+            self.grow()
+        row = self.rows[at]
         row["image"], row["action"], row["reward"] = image, action, reward
         row["terminated"], row["is_first"] = terminated, is_first
+        self.checksums[at] = zlib.crc32(row.tobytes())
         self.added += 1
 
     @property
     def last(self) -> np.void:
         """The newest row."""
-        return self.rows[(self.added - 1) % len(self.rows)]
+        return self.rows[(self.added - 1) % self.ring]
 
-    def parts(self, start: int, stop: int) -> list[np.ndarray]:
-        """Rows start … stop − 1 of all ever added, in order, as one or two views of the ring."""
-        if start == stop:
-            return []
-        first, last = start % len(self.rows), (stop - 1) % len(self.rows) + 1
-        if first < last:
-            return [self.rows[first:last]]
-        return [self.rows[first:], self.rows[:last]]
+    def flush(self) -> np.ndarray:
+        """Bring the file onto the disk. Returns the checksums of the rows that can be sampled."""
+        if self.added:
+            self.file.flush()
+        return self.checksums[np.arange(self.added - len(self), self.added) % self.ring]
+
+    def restore(self, added: int, checksums: np.ndarray) -> None:
+        """Go back to when `added` rows had been added and `flush` returned these checksums.
+
+        Raises:
+            ValueError: in one sentence, if the file does not hold those rows.
+        """
+        self.added = added
+        if added == 0:
+            return
+        wanted = np.arange(added - len(self), added) % self.ring
+        if self.path.stat().st_size:
+            self.map_file()
+        if wanted.max() >= len(self.rows) or any(
+            zlib.crc32(self.rows[at].tobytes()) != known
+            for at, known in zip(wanted, checksums, strict=True)
+        ):
+            raise ValueError(f"{self.path} does not hold its checkpoint's rows: start a new run.")
+        self.checksums[wanted] = checksums
 
     def sample(self, batch: int, length: int, rng: np.random.Generator) -> np.ndarray:
         """`batch` windows of `length` consecutive rows, each equally likely, as records (B, T).
@@ -349,4 +399,4 @@ class Replay:
         if len(self) < length:
             raise ValueError(f"The replay holds {len(self)} rows, fewer than a window of {length}.")
         first = self.added - len(self) + rng.integers(len(self) - length + 1, size=batch)
-        return self.rows[(first[:, None] + np.arange(length)) % len(self.rows)]
+        return self.rows[(first[:, None] + np.arange(length)) % self.ring]

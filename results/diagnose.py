@@ -21,10 +21,22 @@ import torch
 from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from actors import imagined_returns
-from train import Agent, Episode, Run, open_loop, play, read_settings
+from actors import Episode, imagined_returns, play
+from env import EnvironmentFault
+from results.play import add_loading, load, open_loop
+from train import Agent
 
 OPEN_LOOP = 15  # steps that the model is followed without images
+
+# Names of the figures that the verdict looks at.
+DEVIATION = "deviation of the greedy action over states (near 0: frozen)"
+REWARDS = "rewards, R² (1: exact, 0: no better than their mean)"
+SIGMA = "σ of the explorer before its tanh (5 at first)"
+ENDS = "ends of episodes that happened"
+EXPECTED = "ends of episodes that the model expected"
+PROMISED = "discounted return that the model promised"
+EARNED = "discounted return that then happened"
+AFTER = f"rewards, R² after {OPEN_LOOP} steps without images"
 
 
 def r_squared(predicted: np.ndarray, real: np.ndarray) -> float:
@@ -43,6 +55,11 @@ def windows(x: Tensor, length: int) -> Tensor:
     return x.unfold(0, length, 1).movedim(-1, 0)
 
 
+def to_levels(picture: Tensor) -> Tensor:
+    """What the decoder gives, in grey levels from 0 to 255."""
+    return (255 * (picture + 0.5)).clamp(0, 255)
+
+
 @torch.no_grad()
 def measure(agent: Agent, name: str, episode: Episode) -> dict[str, np.ndarray]:
     """What the model says of one episode of an actor, beside what happened.
@@ -53,7 +70,9 @@ def measure(agent: Agent, name: str, episode: Episode) -> dict[str, np.ndarray]:
         open_reward: (M, H, 2) predicted and real after 1 … H steps without images.
         open_image: (M, H, 2) squared error of a pixel in grey levels: of the prediction, and of
         the last image seen.
+        seen_image: (L,) squared error of a pixel of an image that is seen: its reconstruction.
         saturated: (L, A) whether an action is within 0.01 of its bound.
+        greedy, sigma: (L, A) the actor's mode in each state, and the explorer's σ.
     """
     s, model, device = agent.s, agent.model, agent.device
     images, actions, rewards = (
@@ -77,6 +96,11 @@ def measure(agent: Agent, name: str, episode: Episode) -> dict[str, np.ndarray]:
     said["return"] = believed[known], discounted(episode.rewards, s.gamma)[known]
     found = {key: np.stack([p.cpu().numpy(), real], -1) for key, (p, real) in said.items()}
     found["saturated"] = np.abs(episode.actions) > 0.99
+    if hasattr(agent.actors[name], "distribution"):
+        found["sigma"] = agent.actors[name].distribution(states[:-1]).stddev.cpu().numpy()
+    found["greedy"] = agent.actors[name].mode(states[:-1]).cpu().numpy()
+    seen = to_levels(model.decoder(model.decoded(states[1:])))
+    found["seen_image"] = (seen - images[1:].float()).square().mean((1, 2, 3)).cpu().numpy()
 
     if len(rewards) > OPEN_LOOP:
         taken = iter(windows(actions, OPEN_LOOP + 1)[:, ::5])  # the last one is chosen, not taken
@@ -84,8 +108,8 @@ def measure(agent: Agent, name: str, episode: Episode) -> dict[str, np.ndarray]:
         dream = model.imagine(starts, lambda _: next(taken), OPEN_LOOP)
         real = windows(rewards, OPEN_LOOP)[:, : len(rewards) - OPEN_LOOP : 5]
         found["open_reward"] = torch.stack([dream.reward, real], -1).transpose(0, 1).cpu().numpy()
-        picture = model.decoder(model.decoded(dream.state[1:]).flatten(0, 1))
-        picture = (255 * (picture + 0.5)).clamp(0, 255).unflatten(0, dream.reward.shape)
+        picture = to_levels(model.decoder(model.decoded(dream.state[1:]).flatten(0, 1)))
+        picture = picture.unflatten(0, dream.reward.shape)
         truth = windows(images[1:], OPEN_LOOP)[:, : len(rewards) - OPEN_LOOP : 5].float()
         last_seen = images[: len(rewards) - OPEN_LOOP : 5].float()
         errors = [(x - truth).square().mean((2, 3, 4)) for x in (picture, last_seen)]
@@ -100,21 +124,25 @@ def figures(found: dict[str, np.ndarray], episodes: list[Episode]) -> dict[str, 
         "return earned, mean of the episodes": np.mean([e.total for e in episodes]),
         "environment steps an episode": np.mean([e.length for e in episodes]),
         "share of saturated actions (near 1: the actor hardly learns)": found["saturated"].mean(),
-        "rewards, R² (1: exact, 0: no better than their mean)": r_squared(*reward),
-        "ends of episodes that happened": ended[1].sum(),
-        "ends of episodes that the model expected": ended[0].sum(),
+        DEVIATION: found["greedy"].std(0).mean(),
+        REWARDS: r_squared(*reward),
+        "image error where it is seen, grey levels of 255": np.sqrt(found["seen_image"].mean()),
+        ENDS: ended[1].sum(),
+        EXPECTED: ended[0].sum(),
     }
+    if "sigma" in found:
+        named[SIGMA] = found["sigma"].mean()
     if returns.size:
         named |= {
-            "discounted return that the model promised": returns[0].mean(),
-            "discounted return that then happened": returns[1].mean(),
+            PROMISED: returns[0].mean(),
+            EARNED: returns[1].mean(),
             "returns, R² (below 0: worse than their mean)": r_squared(*returns),
         }
     if "open_reward" in found:
         for k in (1, OPEN_LOOP):
             error, still = np.sqrt(found["open_image"][:, k - 1].mean(0))
             r2 = r_squared(*found["open_reward"][:, k - 1].T)
-            named[f"rewards, R² after {k} steps without images"] = r2
+            named[AFTER if k == OPEN_LOOP else f"rewards, R² after {k} step without images"] = r2
             named[f"image error after {k} steps, grey levels of 255"] = error
             named[f"the same, of the last image seen for {k} steps"] = still
     return named
@@ -188,54 +216,101 @@ def draw(path: Path, agent: Agent, played, found, metrics) -> None:
     figure.savefig(path, dpi=100)
 
 
-def diagnose(folder: Path, episodes: int) -> Path:
+# What to look at first, in this order: the first whose condition holds of any actor.
+VERDICTS = (
+    (
+        lambda of: of[DEVIATION] < 0.05,  # of a range of 2; rewards hardly vary then
+        "the actor does the same whatever it sees: raise --action-penalty, and look at what it was "
+        "taught before it froze.",
+    ),
+    (
+        lambda of: of[REWARDS] < 0.3,  # whatever follows is learnt from these
+        "the model does not know the rewards that it is shown: see reward_r2 in metrics.csv; give "
+        "it more prefill, or weigh rewards more.",
+    ),
+    (
+        lambda of: of[ENDS] >= 3 and of[EXPECTED] < 0.5 * of[ENDS],
+        "the model does not see ends coming: weigh terminations more.",
+    ),
+    (
+        lambda of: of[EXPECTED] > 2 * of[ENDS] + 1,
+        "the model expects ends that do not come: nothing far off counts in its dreams.",
+    ),
+    (
+        lambda of: of.get(PROMISED, 0) - of.get(EARNED, 0) > 0.5 * abs(of.get(EARNED, 0)) + 1,
+        "more is promised than earned: the actor exploits the model's errors, or the critic lags.",
+    ),
+    (
+        lambda of: of.get(AFTER, 1) < of[REWARDS] - 0.6,
+        "rewards are known where the image is seen and not in dreams: the dynamics are weak.",
+    ),
+)
+
+
+def verdict(named: dict[str, dict[str, float]]) -> str:
+    """One sentence: what to look at first, given each actor's figures."""
+    for holds, sentence in VERDICTS:
+        for name, of in named.items():
+            if holds(of):
+                return f"Look first at the {name} actor: {sentence}"
+    return "Nothing stands out: the model is true to what these actors meet."
+
+
+def read_metrics(folder: Path) -> list[dict[str, str]]:
+    """The whole rows of metrics.csv; the last may be half written, the file not there yet."""
+    path = folder / "metrics.csv"
+    lines = path.read_text(errors="replace").splitlines() if path.is_file() else []
+    rows = csv.DictReader(lines)
+    return [row for row in rows if None not in row.values() and None not in row]
+
+
+def diagnose(command: argparse.Namespace) -> Path:
     """Prints the figures of a run and returns the page that it drew.
 
     Raises:
         ValueError: in one sentence, if the folder holds no run or no checkpoint yet.
+        EnvironmentFault: if the environment fails.
     """
-    run = Run(read_settings(folder), folder)
-    if not (saved := run.read_checkpoint()):
-        raise ValueError(f"{folder} holds no checkpoint yet: there is nothing to diagnose.")
-    run.set_back(saved)
+    if command.episodes < 1:
+        raise ValueError(f"--episodes is {command.episodes}: give 1 or more.")
+    folder = command.folder
+    s, env, agent, networks = load(folder, command.checkpoint, command.device, command.precision)
     played, found, named = {}, {}, {}
-    for name, actor in run.agent.actors.items():
-        played[name] = [play(run.agent, run.eval_env, actor, 2**31 + k) for k in range(episodes)]
+    for name, actor in agent.actors.items():
+        seeds = [2**31 - 1 - k for k in range(command.episodes)]
+        played[name] = [play(agent, env, actor, seed, s.eval_max_steps) for seed in seeds]
         parts = defaultdict(list)
         for episode in played[name]:
-            for key, value in measure(run.agent, name, episode).items():
+            for key, value in measure(agent, name, episode).items():
                 parts[key].append(value)
         found[name] = {key: np.concatenate(values) for key, values in parts.items()}
         named[name] = figures(found[name], played[name])
-    print(f"{run.s.env}, arm {run.s.arm}, after {run.step:,} environment steps")
+    print(f"{s.env}, arm {s.arm}, networks {networks}")
     print(f"{'':68}" + "".join(f"{name:>15}" for name in named))
     for key in dict.fromkeys(itertools.chain(*named.values())):
         values = [f"{of[key]:15.3f}" if key in of else f"{'–':>15}" for of in named.values()]
         print(f"{key:68}" + "".join(values))
-    metrics = folder / "metrics.csv"
-    lines = metrics.read_text().splitlines() if metrics.exists() else []
-    path = folder / f"diagnosis-{run.step}.png"
-    draw(path, run.agent, played, found, list(csv.DictReader(lines)))
+    print(verdict(named))
+    path = folder / f"diagnosis-{networks}.png"
+    draw(path, agent, played, found, read_metrics(folder))
     return path
 
 
 def main(arguments: list[str]) -> int:
-    """Runs a command line. Returns the exit code: 0 done, 2 bad input."""
+    """Runs a command line. Returns the exit code: 0 done, 1 the environment failed, 2 bad input."""
     parser = argparse.ArgumentParser(
         prog="python results/diagnose.py",
         description="Holds what a run's model predicts against what happens in fresh episodes.",
     )
     parser.add_argument("folder", type=Path, help="a run's folder, runs/NAME")
     parser.add_argument("--episodes", type=int, default=5, help="of each actor (%(default)s)")
-    command = parser.parse_args(arguments)
+    add_loading(parser)
     mpl.use("Agg")
     try:
-        if command.episodes < 1:
-            raise ValueError(f"--episodes is {command.episodes}: give 1 or more.")
-        print(diagnose(command.folder, command.episodes))
-    except (ValueError, OSError) as error:
+        print(diagnose(parser.parse_args(arguments)))
+    except (ValueError, OSError, EnvironmentFault) as error:
         print(error, file=sys.stderr)
-        return 2
+        return 1 if isinstance(error, EnvironmentFault) else 2
     return 0
 
 

@@ -8,6 +8,7 @@ evaluation; below, how much of the environment's own state space the collected r
 FOLDER/table.md.
 """
 
+import argparse
 import csv
 import dataclasses
 import json
@@ -27,48 +28,71 @@ from train import ARMS, default_settings, interval95
 NOT_LEARNT = {
     "env",
     "seed",
-    "run_dir",
-    "device",
     "eval_every",
     "eval_episodes",
+    "eval_max_steps",
     "checkpoint_minutes",
 }
 
+POLICIES = {"random": ":", "zero": "--", "constant": "-."}  # of reference.csv, and their lines
+COLUMNS = {
+    "env_steps", "wall_seconds", "eval_return", "eval_interval95", "eval_length", "coverage",
+}  # fmt: skip
+
 
 def label(settings: dict) -> str:
-    """The arm and the settings that the run changes in it: no line mixes two experiments."""
+    """The arm and the settings that the run changes in it: no line mixes two experiments. A run of
+    an older version is held against what it recorded alone."""
     usual = dataclasses.asdict(default_settings(settings["arm"], settings["preset"]))
     usual |= {"preset": default_settings().preset}
-    changed = [k for k in usual if k not in NOT_LEARNT and settings.get(k) != usual[k]]
-    return ", ".join([settings["arm"]] + [f"{k} {settings.get(k)}" for k in changed])
+    changed = [
+        k for k in usual if k in settings and k not in NOT_LEARNT and settings[k] != usual[k]
+    ]
+    return ", ".join([settings["arm"]] + [f"{k} {settings[k]}" for k in changed])
 
 
-def read_runs(folder: Path) -> dict[str, dict[str, dict[int, dict[str, np.ndarray]]]]:
-    """{env: {label: {seed: {column: values}}}} of every folder in it that holds a run.
-
-    A run that has not been evaluated yet is left out.
+def read_run(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
+    """Settings and columns of metrics.csv of the run whose settings.json it is; no columns if it
+    was not evaluated yet. A last row that is half written is left out.
 
     Raises:
-        ValueError: if two runs are one experiment with one seed, or two seeds of one were evaluated
-            at different steps.
+        ValueError: if it is no run's.
+    """
+    settings = json.loads(path.read_text())
+    label(settings), settings["env"], settings["seed"], settings["action_repeat"]
+    metrics = path.with_name("metrics.csv")
+    lines = metrics.read_text().splitlines() if metrics.exists() else []
+    rows = [row for row in csv.DictReader(lines) if None not in row.values() and None not in row]
+    columns = {name: np.array([float(row[name]) for row in rows]) for name in rows[:1] and rows[0]}
+    if columns and not columns.keys() >= COLUMNS:
+        raise ValueError(f"{metrics} lacks {', '.join(sorted(COLUMNS - columns.keys()))}")
+    return settings, columns
+
+
+def read_runs(folder: Path) -> dict[str, dict[str, dict[str, dict[str, np.ndarray]]]]:
+    """{env: {label: {name: {column: values}}}} of each run in a folder, named by its seed; a second
+    one of a seed also by its folder. Runs without an evaluation are left out, and what is no
+    run is, with a word.
+
+    Raises:
+        ValueError: if two seeds of one experiment were evaluated at different steps.
     """
     runs = defaultdict(lambda: defaultdict(dict))
     for path in sorted(folder.glob("*/settings.json")):
-        settings = json.loads(path.read_text())
-        metrics = path.with_name("metrics.csv")
-        lines = metrics.read_text().splitlines() if metrics.exists() else []
-        rows = [row for row in csv.DictReader(lines) if None not in row.values()]  # whole ones
-        if not rows:
+        try:
+            settings, columns = read_run(path)
+        except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
+            print(f"{path.parent} is left out: {type(error).__name__} {error}", file=sys.stderr)
             continue
-        columns = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+        if not columns:
+            continue
         seeds = runs[settings["env"]][label(settings)]
-        if settings["seed"] in seeds:
-            raise ValueError(f"{path.parent} repeats the seed of another run here: remove one.")
         for other in seeds.values():
             pairs = zip(columns["env_steps"], other["env_steps"], strict=False)
             if any(abs(a - b) >= settings["action_repeat"] for a, b in pairs):
                 raise ValueError(f"{path.parent} was evaluated at other steps than another seed.")
-        seeds[settings["seed"]] = columns
+        name = str(settings["seed"])
+        seeds[f"{name}, {path.parent.name}" if name in seeds else name] = columns
     return runs
 
 
@@ -78,10 +102,13 @@ def read_reference() -> dict[tuple[str, str], dict[str, str]]:
         return {(row["env"], row["policy"]): row for row in csv.DictReader(file)}
 
 
-def draw_curve(axes, seeds: dict[int, dict], column: str, name: str, color: str) -> None:
+def draw_curve(axes, seeds: dict[str, dict], column: str, name: str, color: str) -> None:
     """One experiment's line: up to the last step that all of its seeds have reached."""
     for run in seeds.values():
-        axes.plot(run["env_steps"], run[column], color=color, alpha=0.35, linewidth=0.8)
+        mark = "o" if len(run[column]) == 1 else ""  # a line of one point is not seen
+        axes.plot(
+            run["env_steps"], run[column], color=color, alpha=0.35, linewidth=0.8, marker=mark
+        )
     length = min(len(run[column]) for run in seeds.values())
     values = np.stack([run[column][:length] for run in seeds.values()])
     steps, mean = next(iter(seeds.values()))["env_steps"][:length], values.mean(0)
@@ -108,7 +135,7 @@ def draw(path: Path, runs, reference) -> None:
             axes.set_ylim(every_value.min() - margin, every_value.max() + margin)
             axes.set_ylabel(label)
             if column == "eval_return":
-                for policy, style in (("random", ":"), ("zero", "--")):
+                for policy, style in POLICIES.items():
                     if (env, policy) not in reference:
                         continue
                     earned = float(reference[env, policy]["return"])
@@ -128,7 +155,7 @@ def table(runs, reference) -> str:
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for env, arms in sorted(runs.items()):
-        for policy in ("random", "zero"):
+        for policy in POLICIES:
             if not (row := reference.get((env, policy))):
                 continue
             lines.append(
@@ -149,17 +176,21 @@ def table(runs, reference) -> str:
 
 def main(arguments: list[str]) -> int:
     """Runs a command line. Returns the exit code: 0 done, 2 bad input."""
-    folder = Path(arguments[0]) if arguments else HERE
+    parser = argparse.ArgumentParser(
+        prog="python results/plot.py", description="Draws all runs in a folder: curves, table."
+    )
+    parser.add_argument("folder", type=Path, nargs="?", default=HERE, help="%(default)s")
+    folder = parser.parse_args(arguments).folder
     mpl.use("Agg")
     try:
         runs, reference = read_runs(folder), read_reference()
         if not runs:
             raise ValueError(f"{folder} holds no evaluated run in a folder: nothing to draw.")
+        draw(folder / "curves.png", runs, reference)
+        (folder / "table.md").write_text(table(runs, reference))
     except (ValueError, OSError) as error:
         print(error, file=sys.stderr)
         return 2
-    draw(folder / "curves.png", runs, reference)
-    (folder / "table.md").write_text(table(runs, reference))
     print(table(runs, reference), end="")
     return 0
 

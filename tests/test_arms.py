@@ -19,6 +19,7 @@ from train import (
     default_settings,
     interval95,
     parse,
+    reward_r2,
     to_tensors,
     update,
 )
@@ -50,11 +51,18 @@ PAPER = dict(
 )  # fmt: skip
 SIZES = {"deter", "stoch", "hidden", "units", "depth", "batch_size", "length", "mdn_units"}
 CADENCE = {"steps", "prefill", "train_every", "updates", "eval_every"}
+# What the small preset changes so that the agent learns in an hour, and the paper's literal value.
+LEARNING = {
+    "floor_brightness": (0.4, 1.0), "reward_weight": (20.0, 1.0), "squared_reward": (True, False),
+    "action_penalty": (0.01, 0.0), "beta_share": (True, False), "starts": (0.5, 1.0),
+    "actor_min_std": (0.3, 1e-4),
+}  # fmt: skip
 ACTIONS = 2
 
 
 def tiny(arm: str, **changes) -> Settings:
-    small = dict(
+    """The paper's literal settings, in tiny networks."""
+    small = {name: literal for name, (_, literal) in LEARNING.items()} | dict(
         deter=8, stoch=4, hidden=8, units=8, depth=2, batch_size=3, length=6, horizon=3, mdn_units=8
     )
     return dataclasses.replace(default_settings(arm), **(small | changes))
@@ -147,11 +155,12 @@ def test_paper_preset_holds_the_papers_numbers(arm):
 
 
 @pytest.mark.parametrize("arm", NAMES)
-def test_presets_change_sizes_and_cadence_and_no_coefficient(arm):
+def test_presets_change_sizes_cadence_and_what_learning_was_found_to_need(arm):
     small, paper = (dataclasses.asdict(default_settings(arm, name)) for name in PRESETS)
     differing = {name for name in small if small[name] != paper[name]}
-    assert differing and differing <= SIZES | CADENCE | {"preset"}
+    assert differing and differing <= SIZES | CADENCE | LEARNING.keys() | {"preset"}
     assert all(small[name] <= paper[name] for name in differing & SIZES)
+    assert {name: (small[name], paper[name]) for name in LEARNING} == LEARNING
 
 
 def test_maxent_is_the_default():
@@ -330,7 +339,7 @@ def test_losses_are_the_weighted_sums_of_their_named_terms(arm):
     names = {"image", "reward"} | (
         {"termination", "kl_standard", "jeffreys"} if revised else {"kl"}
     )
-    weights = {"kl_standard": 0.1, "jeffreys": 0.1, "kl": 1.5, "reward": 2.0}
+    weights = {"kl_standard": 0.1, "jeffreys": 0.1, "kl": 1.5, "reward": 2.0, "termination": 10}
     assert terms.keys() == names
     total = sum(weights.get(name, 1) * term for name, term in terms.items())
     assert losses["model"] == pytest.approx(total, rel=1e-6)
@@ -446,3 +455,94 @@ def test_a_reward_that_is_not_a_number_stops_the_update_before_anything_moves():
     with pytest.raises(FloatingPointError, match="Not finite: model/reward"):
         update(agent, batch, 0.1, s)
     assert all(torch.equal(a, b) for a, b in zip(before, all_state(agent), strict=True))
+
+
+# --- what learning was found to need ---
+
+
+def test_half_of_the_live_states_are_drawn_anew_for_each_dream():
+    s = tiny("revised", starts=0.5)
+    agent, batch, starts = make_agent(s), make_batch(s), []
+    imagine = agent.model.imagine
+    agent.model.imagine = lambda start, *rest: starts.append(start) or imagine(start, *rest)
+    for _ in range(2):
+        update(agent, batch, 0.1, s)
+    live = int((~batch["terminated"]).sum())
+    assert [len(start) for start in starts] == 2 * [round(live / 2)]
+    assert len(starts[0].unique(dim=0)) == len(starts[0])  # none twice
+    assert not torch.equal(*starts)
+
+
+@pytest.mark.parametrize("detach_policy", [True, False])
+def test_gradient_passes_through_what_the_policy_sees_unless_it_is_detached(detach_policy):
+    """The first action moves the states after it; whether it moves the actions in them is the
+    switch: an actor's gradient differs, its return does not."""
+    metrics = updated(tiny("revised", detach_policy=detach_policy))[1]
+    other = updated(tiny("revised", detach_policy=not detach_policy))[1]
+    assert metrics["stochastic_actor/return"] == other["stochastic_actor/return"]
+    assert metrics["stochastic_actor/grad_norm"] != other["stochastic_actor/grad_norm"]
+
+
+@pytest.mark.parametrize("name", ["stochastic", "deterministic"])
+def test_action_penalty_draws_saturated_actions_back(name):
+    """From a corner, where tanh has no slope, the penalty alone moves the actor, towards 0."""
+    s = tiny("maxent", action_penalty=1.0, actor_lr=0.01)
+    agent, batch = make_agent(s), make_batch(s)
+    actor = agent.actors[name]
+    torch.nn.init.constant_(actor.net[-1].bias[:ACTIONS], 40.0)
+    state = torch.zeros(1, agent.model.size)
+    before = actor.raw(state).detach()
+    assert (before > 30).all()
+    update(agent, batch, 0.1, s)
+    assert (actor.raw(state) < before).all()
+
+
+def test_beta_share_gives_the_entropys_gradient_that_share_of_the_returns():
+    s = tiny("maxent", beta_share=True)
+    agent = make_agent(s)
+    for beta in (0.2, 0.05):
+        agent.entropy_scale.zero_()
+        looked = update(agent, make_batch(s), beta, s, look=True)
+        share = looked["stochastic_actor/entropy_grad_norm"]
+        assert share == pytest.approx(beta * looked["stochastic_actor/return_grad_norm"], rel=1e-5)
+    before = agent.entropy_scale.item()
+    update(agent, make_batch(s), 0.2, s)
+    assert agent.entropy_scale.item() == before  # measured only when looked at
+    literal = make_agent(tiny("maxent"))
+    update(literal, make_batch(s), 0.2, literal.s, look=True)
+    assert literal.entropy_scale.item() == 1
+
+
+def test_rewards_are_squared_where_asked_and_the_critic_keeps_smooth_l1():
+    s = tiny("maxent", squared_reward=True)
+    assert s.smooth_l1 and not make_agent(s).model.smooth_l1
+    plain, squared = (
+        updated(tiny("maxent", squared_reward=on))[1]["model/reward"] for on in (False, True)
+    )
+    assert plain != squared
+
+
+def test_both_gradients_of_the_objective_are_measured_when_asked():
+    s = tiny("maxent")
+    agent = make_agent(s)
+    torch.manual_seed(1)
+    looked = update(agent, make_batch(s), 0.1, s, look=True)
+    _, plain = updated(s)
+    apart = {f"stochastic_actor/{term}_grad_norm" for term in ("return", "entropy")}
+    assert looked.keys() - plain.keys() == apart
+    assert all(looked[name] == plain[name] for name in plain)  # looking changes nothing
+    total = looked["stochastic_actor/grad_norm"]
+    parts = [looked[name] for name in apart]
+    assert abs(parts[0] - parts[1]) <= total * 1.001 and total <= sum(parts) * 1.001
+
+
+def test_reward_r2_is_one_of_exact_predictions_and_leaves_first_rows_out():
+    s = tiny("maxent")
+    agent, batch = make_agent(s), make_batch(s)
+    batch["reward"][batch["is_first"]] = 1e6
+    states = torch.randn(*batch["reward"].shape, agent.model.size)
+    agent.model.predict_reward = lambda states: batch["reward"][~batch["is_first"]]
+    assert reward_r2(agent, states, batch).item() == 1
+    mean = batch["reward"][~batch["is_first"]].mean()
+    agent.model.predict_reward = lambda states: mean
+    assert reward_r2(agent, states, batch).item() == pytest.approx(0, abs=1e-6)

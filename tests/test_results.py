@@ -1,5 +1,6 @@
 """results/: the diagnosis holds predictions against the right row; the figure needs files alone."""
 
+import csv
 import dataclasses
 import json
 import shutil
@@ -8,10 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import results.diagnose as diagnose
+import results.play as play
 import results.plot as plot
-from train import Agent, Episode, Settings, default_settings, main
+from actors import Episode
+from train import Agent, Settings, default_settings, main
 
 TINY = dict(
     deter=16, stoch=8, hidden=16, units=16, depth=2, mdn_units=16, horizon=5, batch_size=3,
@@ -92,9 +96,94 @@ def test_a_run_is_diagnosed_and_left_as_it_is(tmp_path, capsys):
     assert "deterministic" in capsys.readouterr().out
 
 
+def test_what_is_seen_and_what_is_dreamt_are_held_apart():
+    """The reconstruction's error is of the image in the same row; a perfect decoder makes none."""
+    torch.manual_seed(0)
+    agent = Agent(Settings(**TINY), actions=3, device=torch.device("cpu"), bfloat16=False)
+    episode = made_up_episode(30, terminated=True)
+    exact = torch.from_numpy(episode.images[1:]).float() / 255 - 0.5
+    agent.model.decoder.forward = lambda x: (
+        exact if len(x) == 30 else torch.zeros(len(x), 64, 64, 3)
+    )
+    found = diagnose.measure(agent, "deterministic", episode)
+    assert found["seen_image"] == pytest.approx(np.zeros(30), abs=1e-6)
+    assert found["open_image"][:, :, 0].min() > 100
+
+
+GOOD = {
+    diagnose.REWARDS: 0.9, diagnose.DEVIATION: 0.4, diagnose.ENDS: 5, diagnose.EXPECTED: 4.5,
+    diagnose.PROMISED: 100, diagnose.EARNED: 95, diagnose.AFTER: 0.6,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("worse, word", [
+    ({}, "Nothing stands out"),
+    ({diagnose.REWARDS: 0.1}, "does not know the rewards"),
+    ({diagnose.DEVIATION: 0.01, diagnose.REWARDS: -7}, "the same whatever it sees"),
+    ({diagnose.EXPECTED: 1}, "see ends coming"),
+    ({diagnose.EXPECTED: 30}, "do not come"),
+    ({diagnose.PROMISED: 200}, "promised than earned"),
+    ({diagnose.PROMISED: -20, diagnose.EARNED: -90}, "promised than earned"),
+    ({diagnose.AFTER: -0.5}, "dynamics are weak"),
+])  # fmt: skip
+def test_the_verdict_names_what_to_look_at_first(worse, word):
+    assert word in diagnose.verdict({"stochastic": GOOD, "deterministic": GOOD | worse})
+
+
+def test_a_verdict_needs_no_figure_that_short_episodes_lack():
+    short = {k: v for k, v in GOOD.items() if k not in (diagnose.AFTER, diagnose.PROMISED)}
+    assert "Nothing stands out" in diagnose.verdict({"stochastic": short})
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("a run") / "moved"
+    options = [f"--{name.replace('_', '-')}={value}" for name, value in TINY.items()]
+    assert main(["--run-dir", str(folder.with_name("made")), *options]) == 0
+    folder.with_name("made").rename(folder)
+    return folder
+
+
+@pytest.mark.parametrize("which", ["newest", "best"])
+def test_any_run_can_be_played_and_filmed(trained, which, capsys):
+    arguments = [str(trained), "--episodes", "2", "--video", "--checkpoint", which]
+    assert play.main(arguments) == 0
+    with open(trained / "metrics.csv", newline="") as file:
+        last = list(csv.DictReader(file))[-1]
+    said = capsys.readouterr().out
+    if which == "newest":  # the same seeds as evaluation's
+        assert f"return {float(last['eval_return']):.1f} " in said
+    name = "120" if which == "newest" else "best"
+    with Image.open(trained / f"episode-{name}.gif") as gif:
+        assert gif.size == (3 * 128, 140) and gif.n_frames > 1
+        assert gif.info["duration"] >= play.SHORTEST
+    assert Image.open(trained / f"strip-{name}.png").size == (640, 6 * 64)
+
+
+def test_one_episode_has_no_interval(trained, capsys):
+    assert play.main([str(trained), "--episodes", "1", "--actor", "stochastic"]) == 0
+    said = capsys.readouterr().out
+    assert "±" not in said and "nan" not in said
+
+
+def test_a_film_keeps_real_time_and_its_colours(tmp_path):
+    pictures = np.zeros((3, 100, 64, 64, 3), np.uint8)
+    pictures[0, :, :32] = (0, 180, 0)  # green above, a little of it
+    for k in range(100):
+        pictures[1, k, k // 2] = (250, 200, 10)  # a line that falls: no two frames are the same
+    play.film(tmp_path / "a.gif", pictures, fps=100)  # 10 ms a frame: every other one is shown
+    with Image.open(tmp_path / "a.gif") as gif:
+        assert gif.info["duration"] == 20 and gif.n_frames <= 50
+        pixel = np.array(gif.convert("RGB").getpixel((60, 60)), int)
+        assert np.abs(pixel - (0, 180, 0)).max() < 12
+
+
 def test_bad_input_ends_with_one_sentence(tmp_path, capsys):
-    for program in (diagnose, plot):
+    for program in (diagnose, play, plot):
         assert program.main([str(tmp_path)]) == 2
+        assert len(capsys.readouterr().err.strip().splitlines()) == 1
+    for program in (diagnose, play):
+        assert program.main([str(tmp_path), "--episodes", "0"]) == 2
         assert len(capsys.readouterr().err.strip().splitlines()) == 1
 
 
@@ -110,11 +199,11 @@ def write_run(folder: Path, rows: str, **changes) -> None:
 
 def test_a_run_with_a_switch_of_its_own_is_another_line(tmp_path):
     write_run(tmp_path / "a", "1 2", seed=0)
-    write_run(tmp_path / "b", "3 5", seed=1, run_dir="elsewhere")
+    write_run(tmp_path / "b", "3 5", seed=1, checkpoint_minutes=1.0)
     write_run(tmp_path / "c", "7", seed=1, q_critic=False, preset="paper")
     write_run(tmp_path / "d", "")  # not yet evaluated: left out
     runs = plot.read_runs(tmp_path)["HopperBulletEnv-v0"]
-    assert sorted(runs["maxent"]) == [0, 1]
+    assert sorted(runs["maxent"]) == ["0", "1"]
     (other,) = runs.keys() - {"maxent"}
     assert other.startswith("maxent, preset paper") and "q_critic False" in other
 
@@ -125,30 +214,69 @@ def test_an_environment_without_reference_is_drawn_too(tmp_path):
     assert "| HumanoidBulletEnv-v0 | maxent | 0 | 10,000 |" in (tmp_path / "table.md").read_text()
 
 
-@pytest.mark.parametrize("seed, rows, wrong", [(0, "1 2", "repeats the seed"), (1, "1", "steps")])
-def test_runs_that_cannot_be_averaged_are_refused(seed, rows, wrong, tmp_path, capsys):
+def test_two_runs_of_one_seed_are_two_lines_and_both_count(tmp_path):
     write_run(tmp_path / "a", "1 2")
-    write_run(tmp_path / "b", rows, seed=seed)
+    write_run(tmp_path / "b", "3 4")
+    runs = plot.read_runs(tmp_path)["HopperBulletEnv-v0"]["maxent"]
+    assert list(runs) == ["0", "0, b"]
+    assert plot.main([str(tmp_path)]) == 0
+
+
+def test_seeds_that_cannot_be_averaged_are_refused(tmp_path, capsys):
+    write_run(tmp_path / "a", "1 2")
+    write_run(tmp_path / "b", "1", seed=1)
     path = tmp_path / "b" / "metrics.csv"
     path.write_text(path.read_text().replace("\n5000,", "\n7000,"))
     assert plot.main([str(tmp_path)]) == 2
-    assert wrong in capsys.readouterr().err
+    assert "steps" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("file, content", [
+    ("settings.json", ""), ("settings.json", "[]"), ("settings.json", "{}"),
+    ("settings.json", '{"arm": "warp", "preset": "small"}'), ("settings.json", '{"arm"'),
+    ("metrics.csv", "a,b\n1,2\n"), ("metrics.csv", "env_steps\nmany\n"),
+])  # fmt: skip
+def test_what_is_no_run_is_left_out_with_a_word(file, content, tmp_path, capsys):
+    write_run(tmp_path / "a", "1 2")
+    write_run(tmp_path / "b", "3 4", seed=1)
+    (tmp_path / "b" / file).write_text(content)
+    assert plot.main([str(tmp_path)]) == 0
+    said = capsys.readouterr()
+    assert "maxent | 0 |" in said.out and "maxent | 1 |" not in said.out
+    assert len(said.err.splitlines()) == 1 and str(tmp_path / "b") in said.err
+
+
+def test_a_row_that_is_half_written_is_left_out(tmp_path, trained):
+    write_run(tmp_path / "a", "1 2 3")
+    path = tmp_path / "a" / "metrics.csv"
+    path.write_text(path.read_text()[:-8])
+    (columns,) = plot.read_runs(tmp_path)["HopperBulletEnv-v0"]["maxent"].values()
+    assert columns["eval_return"].tolist() == [1, 2]
+    assert len(diagnose.read_metrics(tmp_path / "a")) == 2
+    assert diagnose.read_metrics(tmp_path) == []
 
 
 def test_committed_runs_give_the_committed_table(tmp_path):
-    for name in ("", "20k"):
-        folder = tmp_path / f"results{name}"
+    for name in ("", "old_view", "old_view/20k"):
+        folder = tmp_path / name.replace("/", "-") / "runs"
         for path in (RESULTS / name).glob("*/settings.json"):
             shutil.copytree(path.parent, folder / path.parent.name)
+        if not folder.exists():
+            continue
         assert plot.main([str(folder)]) == 0
         assert (folder / "table.md").read_text() == (RESULTS / name / "table.md").read_text()
         assert (folder / "curves.png").stat().st_size > 10_000
 
 
-def test_committed_runs_are_whole_and_of_this_programs_settings():
+def test_committed_runs_are_of_this_programs_settings():
     fields = set(Settings.__dataclass_fields__)
-    for path in RESULTS.glob("**/settings.json"):
-        saved = json.loads(path.read_text())
-        assert saved.keys() == fields, path
+    for path in RESULTS.glob("*/settings.json"):
+        assert json.loads(path.read_text()).keys() == fields, path
+
+
+def test_committed_runs_of_the_old_view_are_whole():
+    paths = list(RESULTS.glob("old_view/**/settings.json"))
+    assert len(paths) == 19
+    for path in paths:
         last = path.with_name("metrics.csv").read_text().splitlines()[-1]
-        assert int(last.split(",")[0]) >= saved["steps"], path
+        assert int(last.split(",")[0]) >= json.loads(path.read_text())["steps"], path

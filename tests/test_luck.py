@@ -1,0 +1,405 @@
+"""A user's ordinary luck: any environment, any terminal, a second run, damaged files."""
+
+import csv
+import json
+import os
+import shlex
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import ClassVar
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.spaces import Box
+from test_train import LONG, TINY, command, metrics, one_sentence, run, start, wait_for
+
+import train
+
+FAST = [*TINY, "--steps", "120", "--eval-every", "60", "--eval-episodes", "1"]
+
+
+class Base(gym.Env):
+    """Ends after 20 steps, each worth 1."""
+
+    metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 30}
+    action_space, observation_space = Box(-1, 1, (2,), np.float32), Box(-10, 10, (3,), np.float32)
+
+    def __init__(self, render_mode=None):
+        self.render_mode, self.t, self.steps = render_mode, 0, 0
+
+    def obs(self):
+        return self.np_random.normal(size=3).astype(np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return self.obs(), {}
+
+    def step(self, action):
+        self.t, self.steps = self.t + 1, self.steps + 1
+        return self.obs(), 1.0, self.t >= 20, False, {}
+
+    def render(self):
+        image = np.zeros((64, 64, 3), np.uint8)
+        image[min(self.t, 63)] = 255
+        return image
+
+
+@pytest.fixture
+def register(monkeypatch):
+    def register(entry_point, name="Stub-v0") -> str:
+        monkeypatch.setitem(gym.registry, name, EnvSpec(name, entry_point))
+        return name
+
+    return register
+
+
+@pytest.fixture
+def stub_run(register, tmp_path) -> Path:
+    """The folder of a short finished run."""
+    folder = tmp_path / "run"
+    assert train.main(["--env", register(Base), "--run-dir", str(folder), *FAST]) == 0
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def refused(arguments, capsys, *words) -> None:
+    """One sentence with these words, exit code 2."""
+    capsys.readouterr()
+    assert train.main([str(a) for a in arguments]) == 2
+    said = capsys.readouterr().err
+    assert one_sentence(said) and all(word in said for word in words), said
+
+
+# ---- check, then create --------------------------------------------------------------------------
+
+
+def test_runs_begun_in_the_same_second_have_a_folder_each(register, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("time.strftime", lambda _: "20260101-000000")
+    name = register(Base, "space/Stub-v0")
+    for _ in range(3):
+        assert train.main(["--env", name, *FAST]) == 0
+    folders = list((tmp_path / "runs").iterdir())  # none nested, whatever the id
+    assert len(folders) == 3
+    assert all(len(metrics(folder)) == 2 for folder in folders)
+
+
+def test_a_run_that_goes_on_elsewhere_is_not_resumed_and_who_has_it_is_said(tmp_path):
+    folder = tmp_path / "run"
+    process = start("--run-dir", folder, *LONG, "--steps", 100_000)
+    try:
+        wait_for(folder / "settings.json", process)
+        second = run("--resume", folder)
+        assert second.returncode == 2 and one_sentence(second.stderr)
+        assert str(process.pid) in second.stderr
+    finally:
+        process.kill()
+        process.communicate()
+    assert run("--resume", folder, "--steps", 200).returncode == 0  # the lock died with it
+
+
+def test_a_folder_that_cannot_be_filled_is_not_left_behind(register, tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("train.write_whole", full)
+    assert train.main(["--env", register(Base), "--run-dir", str(tmp_path / "run"), *FAST]) == 2
+    assert list(tmp_path.iterdir()) == []
+
+
+# ---- what only measures --------------------------------------------------------------------------
+
+
+class Infinite(Base):
+    def obs(self):
+        return np.array([np.inf, 0, 0], np.float32)
+
+
+class Words(Base):
+    observation_space = gym.spaces.Dict({"a": Box(-1, 1, (2,)), "b": gym.spaces.Text(500)})
+
+    def obs(self):
+        return {"a": np.zeros(2, np.float32), "b": "word"}
+
+
+@pytest.mark.parametrize("environment", [Infinite, Words])
+def test_states_that_cannot_be_measured_stop_nothing(environment, register, tmp_path):
+    folder = tmp_path / "run"
+    assert train.main(["--env", register(environment), "--run-dir", str(folder), *FAST]) == 0
+    assert [row["coverage"] for row in metrics(folder)] == ["nan", "nan"]
+
+
+class Endless(Base):
+    def step(self, action):
+        return *super().step(action)[:2], False, False, {}
+
+
+def test_an_evaluation_of_an_endless_episode_ends(register, tmp_path):
+    folder = tmp_path / "run"
+    arguments = ["--env", register(Endless), "--run-dir", str(folder), "--eval-max-steps", "30"]
+    assert train.main([*arguments, *FAST]) == 0
+    assert [row["eval_length"] for row in metrics(folder)] == ["30", "30"]
+
+
+# ---- environments that fail later ----------------------------------------------------------------
+
+
+class Fails(Base):
+    """In the 90th step of its life, as the class says."""
+
+    def step(self, action):
+        result = super().step(action)
+        return self.fail(result) if self.steps == 90 else result
+
+
+class Raises(Fails):
+    def fail(self, result):
+        return 1 / 0
+
+
+class NoNumber(Fails):
+    def fail(self, result):
+        return result[0], float("nan"), *result[2:]
+
+
+class Enormous(Fails):
+    def fail(self, result):
+        return result[0], 1e30, *result[2:]
+
+
+@pytest.mark.parametrize(
+    "environment, word", [(Raises, "ZeroDivisionError"), (NoNumber, "nan"), (Enormous, "1e+30")]
+)
+def test_what_an_environment_does_later_is_one_sentence_that_names_it(
+    environment, word, register, tmp_path, capfd
+):
+    folder, name = tmp_path / "run", register(environment)
+    assert train.main(["--env", name, "--run-dir", str(folder), *FAST]) == 1
+    said = capfd.readouterr().err
+    assert "Traceback" not in said and f"{name} " in said and word in said
+    assert "--model-lr" not in said
+    kept = train.read_checkpoint(folder)[1]["kept"]
+    assert 80 < kept["step"] < 90 and kept["over"]  # what was learnt is saved; another follows
+    assert train.main(["--resume", str(folder)]) == 0  # this process's is past its 90th step
+    assert len(metrics(folder)) == 2
+
+
+# ---- facts of the machine ------------------------------------------------------------------------
+
+
+def test_a_run_holds_nothing_of_its_machine_and_may_move(stub_run, register, capsys):
+    saved = json.loads((stub_run / "settings.json").read_text())
+    assert not saved.keys() & {"device", "precision", "run_dir"}
+    moved = stub_run.with_name("moved away")
+    stub_run.rename(moved)
+    arguments = ["--resume", str(moved), "--steps", "180", "--precision", "float32"]
+    assert train.main(arguments) == 0
+    said = capsys.readouterr().err
+    was = "bfloat16" if train.has_bfloat16(torch.device("cpu")) else "float32"
+    assert ("otherwise than it would have" in said) == (was == "bfloat16")
+
+
+def test_a_finished_run_can_be_made_longer_and_says_what_changed(stub_run, capsys):
+    before = metrics(stub_run)
+    assert train.main(["--resume", str(stub_run), "--steps", "180", "--actor-lr", "1e-5"]) == 0
+    said = capsys.readouterr().err
+    assert "steps: 180 in the place of 120" in said and "β" in said
+    assert "actor_lr: 1e-05 in the place of 8e-05" in said
+    rows = metrics(stub_run)
+    assert rows[: len(before)] == before and int(rows[-1]["env_steps"]) == 180
+    assert json.loads((stub_run / "settings.json").read_text())["actor_lr"] == 1e-5
+    optimisers = train.read_checkpoint(stub_run)[1]["optimisers"]
+    rates = {name: o["param_groups"][0]["lr"] for name, o in optimisers.items()}
+    assert rates["stochastic_actor"] == 1e-5 and rates["model"] == 6e-4
+
+
+def test_what_makes_a_run_what_it_is_cannot_be_changed(stub_run, capsys):
+    before = contents(stub_run)
+    refused(["--resume", stub_run, "--gamma", "0.5"], capsys, "gamma")
+    refused(["--resume", stub_run, "--run-dir", "x"], capsys, "run_dir")
+    assert contents(stub_run) == before
+
+
+# ---- text and shells -----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def module(tmp_path_factory) -> dict[str, str]:
+    """Environment variables with which `--env mine:Mine-v0` finds its module."""
+    folder = tmp_path_factory.mktemp("modules")
+    own = "import test_luck, gymnasium\ngymnasium.register('Mine-v0', test_luck.Base)\n"
+    (folder / "mine.py").write_text(own)
+    path = os.pathsep.join([str(folder), str(Path(__file__).parent)])
+    return {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
+
+
+def shell(line: str, module: dict[str, str], **variables) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        line, shell=True, executable="/bin/bash", capture_output=True, timeout=120,
+        env=os.environ | module | variables,
+    )  # fmt: skip
+
+
+def mine(folder: Path) -> str:
+    return shlex.join(command("--env", "mine:Mine-v0", "--run-dir", folder, *FAST))
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
+def test_a_terminal_that_knows_few_letters_stops_nothing(encoding, tmp_path, module):
+    done = shell(mine(tmp_path / "run"), module, PYTHONIOENCODING=encoding)
+    assert done.returncode == 0 and b"Traceback" not in done.stderr, done.stderr
+    help_text = shell(shlex.join(command("--help")), module, PYTHONIOENCODING=encoding)
+    assert help_text.returncode == 0 and b"--beta-start" in help_text.stdout
+
+
+@pytest.mark.parametrize("ending", ["| head -c 1", "> /dev/full", ">&-", "2>&-", "2> /dev/full"])
+def test_a_reader_who_goes_away_stops_nothing(ending, tmp_path, module):
+    folder = tmp_path / "run"
+    done = shell(f"set -o pipefail; {mine(folder)} {ending}", module)
+    assert b"Traceback" not in done.stderr and b"Exception" not in done.stderr, done.stderr
+    assert done.returncode == 0 and len(metrics(folder)) == 2
+
+
+def test_nothing_but_our_own_words_is_on_the_terminal(tmp_path, module):
+    done = shell(mine(tmp_path / "run"), module)
+    assert b"argv[0]" not in done.stdout + done.stderr and b"pybullet" not in done.stderr
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_schedulers_signal_and_a_closed_terminal_save_as_ctrl_c_does(number, tmp_path):
+    folder = tmp_path / "a folder with spaces"
+    process = start("--run-dir", folder, *LONG)
+    wait_for(folder / "checkpoint.previous.pt", process)
+    process.send_signal(number)
+    said, errors = process.communicate()
+    assert process.returncode == 0, errors
+    advice = shlex.split(said.split("Go on with: ")[1])
+    assert Path(advice[0]) == Path(sys.executable) and advice[-1] == str(folder)
+    assert run(*advice[2:], "--steps", 400).returncode == 0  # the advice, pasted
+
+
+# ---- files that are damaged or edited ------------------------------------------------------------
+
+
+def flip(path: Path, at: float) -> None:
+    content = bytearray(path.read_bytes())
+    content[int(at * len(content))] ^= 255
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("damage", ["flipped", "shorter", "gone"])
+def test_a_replay_that_is_not_its_checkpoints_is_refused(damage, stub_run, capsys):
+    path = stub_run / "replay.bin"
+    if damage == "flipped":
+        flip(path, 0.3)
+    elif damage == "shorter":
+        path.write_bytes(path.read_bytes()[:50_000])
+    else:
+        path.unlink()
+        path.touch()
+    before = contents(stub_run)
+    refused(["--resume", stub_run, "--steps", "180"], capsys, "replay.bin")
+    assert contents(stub_run) == before
+
+
+@pytest.mark.parametrize("change", [
+    {"arm": "warp"}, {"collect": "nobody"}, {"steps": "many"}, {"steps": 1.5}, {"gamma": [1]},
+    {"entropy": "no"}, {"seed": -1}, {"env": 7}, {"gamma": 2.0},
+])  # fmt: skip
+def test_settings_that_cannot_be_are_refused_by_name(change, stub_run, capsys):
+    path = stub_run / "settings.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    (name,) = change
+    refused(["--resume", stub_run], capsys, name)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "7", "null", '"a"', "\0\0", "\ufeff{}"])
+def test_settings_that_are_none_are_refused(text, stub_run, capsys):
+    (stub_run / "settings.json").write_text(text)
+    refused(["--resume", stub_run], capsys, "run")
+
+
+def test_a_run_without_checkpoints_is_refused_and_left_as_it_is(stub_run, capsys):
+    for name in train.CHECKPOINTS:
+        (stub_run / name).unlink()
+    before = contents(stub_run)
+    refused(["--resume", stub_run, "--steps", "180"], capsys, "no whole checkpoint")
+    assert contents(stub_run) == before
+
+
+def test_a_lost_row_of_metrics_is_said_and_the_run_goes_on(stub_run, capsys):
+    path = stub_run / "metrics.csv"
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(lines[:-1]))
+    assert train.main(["--resume", str(stub_run), "--steps", "180"]) == 0
+    assert "lost rows" in capsys.readouterr().err
+    assert [int(row["env_steps"]) for row in metrics(stub_run)] == [60, 180]
+
+
+def test_what_is_not_finite_leaves_the_checkpoint_before_it_and_a_lower_rate_is_taken(
+    register, tmp_path, capsys
+):
+    folder = tmp_path / "run"
+    arguments = ["--env", register(Base), "--run-dir", str(folder), *FAST]
+    assert train.main([*arguments, "--model-lr", "1e30"]) == 1
+    checkpoints = {k: v for k, v in contents(folder).items() if k.startswith("checkpoint")}
+    for _ in range(2):
+        assert train.main(["--resume", str(folder)]) == 1
+    assert checkpoints == {k: v for k, v in contents(folder).items() if k.startswith("checkpoint")}
+    assert "--model-lr" in capsys.readouterr().err
+    assert train.main(["--resume", str(folder), "--model-lr", "1e-4"]) == 0
+
+
+def test_memory_that_runs_out_in_an_update_names_what_asked_for_it(
+    register, tmp_path, monkeypatch, capfd
+):
+    def sample(*_):
+        return torch.empty(2**60)
+
+    monkeypatch.setattr("env.Replay.sample", sample)
+    folder = tmp_path / "run"
+    assert train.main(["--env", register(Base), "--run-dir", str(folder), *FAST]) == 1
+    said = capfd.readouterr().err
+    assert "Traceback" not in said and "--batch-size 3" in said and "--resume" in said
+
+
+# ---- what is kept --------------------------------------------------------------------------------
+
+
+def test_the_best_evaluations_networks_are_kept(register, tmp_path, monkeypatch):
+    returns = iter([3.0, 9.0, 5.0])
+    states = []
+
+    def evaluate(agent, env, s, show):
+        states.append({k: v.clone() for k, v in agent.state_dict().items()})
+        return [train.Episode(*[None] * 5, total=next(returns), length=1)]
+
+    monkeypatch.setattr("train.evaluate", evaluate)
+    folder = tmp_path / "run"
+    arguments = ["--env", register(Base), "--run-dir", str(folder), *FAST, "--steps", "180"]
+    assert train.main(arguments) == 0
+    best = torch.load(folder / "best.pt", weights_only=True)
+    equal = [all(torch.equal(best[k], state[k]) for k in best) for state in states]
+    assert equal == [False, True, False]
+
+
+def test_losses_are_in_tensorboard_before_the_first_evaluation(register, tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    folder = tmp_path / "run"
+    arguments = ["--env", register(Base), "--run-dir", str(folder), *FAST]
+    assert train.main([*arguments, "--eval-every", "120"]) == 0
+    events = EventAccumulator(str(folder)).Reload()
+    first = events.Scalars("update/model/image")[0].step
+    assert first < events.Scalars("eval_return")[0].step == 120
+    with open(folder / "metrics.csv", newline="") as file:
+        assert next(csv.reader(file))[0] == "env_steps"
