@@ -24,7 +24,7 @@ from tqdm import tqdm
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 from results import plot
-from train import ARMS
+from train import ARMS, Patient
 
 ROBOTS = ("Hopper", "Walker2D", "HalfCheetah", "Ant")
 SMOKE = shlex.split(
@@ -76,7 +76,7 @@ def steps_made(folder: Path) -> int:
     """Environment steps at the last evaluation of a run; 0 before the first."""
     path = folder / "metrics.csv"
     lines = path.read_text().splitlines() if path.exists() else []
-    made = [row["env_steps"] for row in csv.DictReader(lines)]
+    made = [row.get("env_steps") or "" for row in csv.DictReader(lines)]
     return int(made[-1]) if made and made[-1].isdigit() else 0
 
 
@@ -158,7 +158,7 @@ def main(arguments: list[str]) -> int:
             signal.signal(number, lambda *_: process.send_signal(signal.SIGINT))
         return process.wait()
     record(command)
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: stopped.append(None))
     failed = run_all(command, stopped)
     for name in failed:
@@ -172,4 +172,5 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
+    sys.stdout, sys.stderr = Patient(sys.stdout), Patient(sys.stderr)
     sys.exit(main(sys.argv[1:]))
