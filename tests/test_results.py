@@ -160,6 +160,14 @@ def test_any_run_can_be_played_and_filmed(trained, which, capsys):
     assert Image.open(trained / f"strip-{name}.png").size == (640, 6 * 64)
 
 
+def test_train_py_evaluates_by_it(trained, tmp_path, capfd):
+    assert main(["--evaluate", str(trained), "--episodes", "1", "--checkpoint", "best"]) == 0
+    assert "networks best" in capfd.readouterr().out
+    for arguments in (["--evaluate", str(tmp_path)], ["--evaluate", "x", "--episodes", "0"]):
+        assert main(arguments) == 2
+        assert len(capfd.readouterr().err.strip().splitlines()) == 1
+
+
 def test_one_episode_has_no_interval(trained, capsys):
     assert play.main([str(trained), "--episodes", "1", "--actor", "stochastic"]) == 0
     said = capsys.readouterr().out
