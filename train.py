@@ -233,7 +233,6 @@ def update_actor(
         loss = critic_loss(critic, dream, returns, s.smooth_l1)
     metrics[f"{name}_critic/loss"] = loss
     agent.step(f"{name}_critic", loss, metrics)
-
     if explores:
         with agent.autocast():
             loss = mdn_loss(agent.mdn, dream.state, dream.continues, s.gamma_q).mean()
@@ -605,6 +604,7 @@ class Run:
         content = {
             "agent": self.agent.state_dict(),
             "optimisers": {name: o.state_dict() for name, o in self.agent.optimisers.items()},
+            "settings": self.s.to_json(),
             "kept": {name: getattr(self, name) for name in self.KEPT},
             "checksums": torch.from_numpy(self.replay.flush()),
             "torch_random": torch.get_rng_state(),
@@ -617,10 +617,15 @@ class Run:
         """Go back to the newest whole checkpoint.
 
         Raises:
-            ValueError: in one sentence, if there is none, or the replay is not its own; nothing in
-                the folder is then changed.
+            ValueError: in one sentence, if there is none, or the replay is not its own.
         """
         path, saved = read_checkpoint(self.folder)
+        made, now = json.loads(saved["settings"]), dataclasses.asdict(self.s)
+        if edited := [k for k in now if k not in CHANGEABLE and now[k] != made.get(k)]:
+            raise ValueError(
+                f"{self.folder} was made with other settings than its settings.json says: "
+                f"{', '.join(f'{k} {made.get(k)}' for k in edited)}; put them back."
+            )
         machine = self.machine
         for name in self.KEPT:
             setattr(self, name, saved["kept"][name])
@@ -697,7 +702,7 @@ def read_checkpoint(folder: Path) -> tuple[Path, dict]:
             with contextlib.suppress(Exception), zipfile.ZipFile(path) as file:  # damage has many
                 if file.testzip() is None:  # each part has the checksum that was written with it
                     saved = torch.load(path, map_location="cpu", weights_only=True)
-                    if saved["kept"].keys() == set(Run.KEPT):
+                    if "settings" in saved and saved["kept"].keys() == set(Run.KEPT):
                         return path, saved
             say(f"{path} is damaged: looking for the one before it.")
     raise ValueError(f"{folder} holds no whole checkpoint: start a new run in another folder.")
@@ -891,6 +896,7 @@ def main(arguments: list[str]) -> int:
         rest = [argument for argument in arguments if argument != "--evaluate"]
         return subprocess.call([sys.executable, player, *rest])
     keep_freed_memory()
+    threading.excepthook = leave_out_os_errors
     try:
         command = parse(arguments)
         run = new_run(command) if command.resume is None else resumed_run(command)
@@ -915,15 +921,13 @@ def train_run(run: Run) -> int:
     print(run.describe(), flush=True)
     resume = "Go on with: " + shlex.join([sys.executable, __file__, "--resume", str(run.folder)])
     every = 0.5 if sys.stderr.isatty() else 30  # seconds between two lines of a log file
-    threading.excepthook = leave_out_os_errors
     try:
         with (
             tqdm(total=run.s.steps, initial=run.step, unit="step", mininterval=every) as run.bar,
             SummaryWriter(run.folder, purge_step=run.step + 1) as run.writer,
         ):
             for name in ("SIGINT", "SIGTERM", "SIGHUP"):  # Windows has no SIGHUP
-                if hasattr(signal, name):
-                    signal.signal(getattr(signal, name), stop)
+                signal.signal(getattr(signal, name, signal.SIGINT), stop)
             train(run, stopped.is_set)
     except FloatingPointError as error:
         say(f"{error} The last checkpoint is from before: go on from it with a lower --model-lr, "

@@ -355,6 +355,14 @@ def test_settings_that_cannot_be_are_refused_by_name(change, stub_run, capsys):
     refused(["--resume", stub_run], capsys, name)
 
 
+def test_an_edited_setting_that_made_the_run_what_it_is_is_not_taken(stub_run, capsys):
+    path = stub_run / "settings.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"gamma": 0.5}))
+    before = contents(stub_run)
+    refused(["--resume", stub_run, "--steps", "180"], capsys, "gamma 0.99")
+    assert contents(stub_run) == before
+
+
 @pytest.mark.parametrize("text", ["", "{", "[]", "7", "null", '"a"', "\0\0", "\ufeff{}"])
 def test_settings_that_are_none_are_refused(text, stub_run, capsys):
     (stub_run / "settings.json").write_text(text)
