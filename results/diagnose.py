@@ -8,7 +8,6 @@ may still be going on: nothing of it is changed.
 """
 
 import argparse
-import csv
 import itertools
 import sys
 from collections import defaultdict
@@ -24,6 +23,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from actors import Episode, imagined_returns, play
 from env import EnvironmentFault
 from results.play import add_loading, load, open_loop
+from results.plot import read_metrics
 from train import Agent, Patient
 
 OPEN_LOOP = 15  # steps that the model is followed without images
@@ -166,19 +166,18 @@ def draw_reliability(axes, predicted: np.ndarray, real: np.ndarray, label: str) 
     axes.plot(*np.array(points).T, "o-", label=f"{label}, {real.sum():.0f} ends")
 
 
-def draw_metrics(axes, metrics: list[dict[str, str]], names: list[str]) -> None:
+def draw_metrics(axes, metrics: dict[str, np.ndarray], names: list[str]) -> None:
     """Columns of metrics.csv over environment steps, each on a scale of its own from 0 to 1."""
-    steps = [float(row["env_steps"]) for row in metrics]
     for name in names:
-        if not metrics or name not in metrics[0]:
-            continue
-        values = np.array([float(row[name]) for row in metrics])
-        low, high = np.nanmin(values), np.nanmax(values)
-        scaled = (values - low) / max(high - low, 1e-12)
-        axes.plot(steps, scaled, label=f"{name}: {low:.3g} to {high:.3g}")
+        known = np.isfinite(metrics.get(name, []))
+        if known.any():
+            values, steps = metrics[name][known], metrics["env_steps"][known]
+            scaled = (values - values.min()) / max(np.ptp(values), 1e-12)
+            label = f"{name}: {values.min():.3g} to {values.max():.3g}"
+            axes.plot(steps, scaled, "o-" if len(steps) == 1 else "-", label=label)
+            axes.legend(fontsize=6)
     axes.set_title("metrics.csv, each from its least to its greatest", fontsize=9)
     axes.set_xlabel("environment steps")
-    axes.legend(fontsize=6)
 
 
 def draw(path: Path, agent: Agent, played, found, metrics) -> None:
@@ -256,14 +255,6 @@ def verdict(named: dict[str, dict[str, float]]) -> str:
     return "Nothing stands out: the model is true to what these actors meet."
 
 
-def read_metrics(folder: Path) -> list[dict[str, str]]:
-    """The whole rows of metrics.csv; the last may be half written, the file not there yet."""
-    path = folder / "metrics.csv"
-    lines = path.read_text(errors="replace").splitlines() if path.is_file() else []
-    rows = csv.DictReader(lines)
-    return [row for row in rows if None not in [*row, *row.values()] and "env_steps" in row]
-
-
 def diagnose(command: argparse.Namespace) -> Path:
     """Prints the figures of a run and returns the page that it drew.
 
@@ -292,7 +283,7 @@ def diagnose(command: argparse.Namespace) -> Path:
         print(f"{key:68}" + "".join(values))
     print(verdict(named))
     path = folder / f"diagnosis-{networks}.png"
-    draw(path, agent, played, found, read_metrics(folder))
+    draw(path, agent, played, found, read_metrics(folder / "metrics.csv"))
     return path
 
 

@@ -3,9 +3,9 @@
     python results/plot.py [FOLDER]
 
 draws FOLDER/curves.png (results/ if none is given), one column of panels an environment, one line
-an arm: the mean over seeds and its 95% t-interval, each seed as a thin line; above, returns of
-evaluation; below, how much of the environment's own state space the collected rows cover. Writes
-FOLDER/table.md.
+an arm: the mean over its runs and its 95% t-interval, each run as a thin line; above, returns of
+evaluation beside what actions earn that look at nothing; below, how much of the environment's own
+state space the collected rows cover. Writes FOLDER/table.md.
 """
 
 import argparse
@@ -13,6 +13,7 @@ import csv
 import dataclasses
 import json
 import sys
+import textwrap
 from collections import defaultdict
 from pathlib import Path
 
@@ -24,98 +25,89 @@ HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
 from train import ARMS, Patient, default_settings, interval95
 
-# what may differ between runs of one line: who and where, not what is learnt
+# What may differ between runs of one line: who, where and how looked at, not what is learnt.
 NOT_LEARNT = {
-    "env",
-    "seed",
-    "eval_every",
-    "eval_episodes",
-    "eval_max_steps",
-    "checkpoint_minutes",
-}
-
-POLICIES = {"random": ":", "zero": "--", "constant": "-."}  # of reference.csv, and their lines
-COLUMNS = {
-    "env_steps", "wall_seconds", "eval_return", "eval_interval95", "eval_length", "coverage",
+    "env", "seed", "eval_every", "eval_episodes", "eval_max_steps", "checkpoint_minutes",
+    "run_dir", "device", "precision",  # in files of before 2026-11-25
 }  # fmt: skip
+POLICIES = {"random": ":", "zero": "--", "constant": "-."}  # of reference.csv, and their lines
+COLUMNS = set("env_steps wall_seconds eval_return eval_interval95 eval_length coverage".split())
 
 
 def label(settings: dict) -> str:
-    """The arm and the settings that the run changes in it: no line mixes two experiments. A run of
-    an older version is held against what it recorded alone."""
+    """The arm and the settings that the run changes in it: no line mixes two experiments. A file of
+    another version is held to what it has: a setting that it lacks is not changed."""
     usual = dataclasses.asdict(default_settings(settings["arm"], settings["preset"]))
-    usual |= {"preset": default_settings().preset}
-    changed = [
-        k for k in usual if k in settings and k not in NOT_LEARNT and settings[k] != usual[k]
-    ]
-    return ", ".join([settings["arm"]] + [f"{k} {settings[k]}" for k in changed])
+    usual["preset"] = default_settings().preset
+    changed = [k for k, v in settings.items() if k not in NOT_LEARNT and v != usual.get(k)]
+    return ", ".join([settings["arm"]] + [f"{k} {settings[k]}" for k in changed if k != "arm"])
 
 
-def read_run(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
-    """Settings and columns of metrics.csv of the run whose settings.json it is; no columns if it
-    was not evaluated yet. A last row that is half written is left out.
-
-    Raises:
-        ValueError: if it is no run's.
-    """
-    settings = json.loads(path.read_text())
-    label(settings), settings["seed"], int(settings["action_repeat"]), settings["env"].lower()
-    metrics = path.with_name("metrics.csv")
-    lines = metrics.read_text().splitlines() if metrics.exists() else []
-    rows = [row for row in csv.DictReader(lines) if None not in row.values() and None not in row]
-    columns = {name: np.array([float(row[name]) for row in rows]) for name in rows[:1] and rows[0]}
-    if columns and not columns.keys() >= COLUMNS:
-        raise ValueError(f"{metrics} lacks {', '.join(sorted(COLUMNS - columns.keys()))}")
-    return settings, columns
+def read_settings(path: Path) -> tuple[str, str, str]:
+    """Environment, label and seed of a run's settings.json, of whichever version. A ValueError, in
+    one sentence, if it is none."""
+    try:
+        settings = json.loads(path.read_text())
+        return str(settings["env"]), label(settings), str(int(settings["seed"]))
+    except (ValueError, KeyError, TypeError) as error:
+        what = f"({type(error).__name__} {error})"
+        raise ValueError(f"{path} is no run's settings {what}: left out.") from None
 
 
-def differ(run: dict, other: dict, action_repeat: int) -> bool:
-    """Whether two runs were evaluated at different steps."""
-    pairs = zip(run["env_steps"], other["env_steps"], strict=False)
-    return any(abs(a - b) >= action_repeat for a, b in pairs)
+def read_metrics(path: Path) -> dict[str, np.ndarray]:
+    """Columns of a metrics.csv, of its whole rows: the last one of a run that goes on may be half
+    written, or none be there yet. A ValueError, in one sentence, if it is another table."""
+    text = path.read_text(errors="replace") if path.is_file() else ""
+    rows = list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))
+    if rows and not rows[0].keys() >= COLUMNS:
+        lacking = ", ".join(sorted(COLUMNS - rows[0].keys()))
+        raise ValueError(f"{path} is no run's metrics, without {lacking}: left out.")
+    try:
+        return {name: np.array([float(row[name]) for row in rows]) for name in rows[:1] and rows[0]}
+    except (ValueError, TypeError):
+        raise ValueError(f"{path} has rows that are no numbers: left out.") from None
 
 
 def read_runs(folder: Path) -> dict[str, dict[str, dict[str, dict[str, np.ndarray]]]]:
-    """{env: {label: {name: {column: values}}}} of each run in a folder, named by its seed; a second
-    one of a seed also by its folder. Runs without an evaluation are left out, and what is no
-    run is, with a word.
-    """
+    """{env: {label: {name: {column: values}}}} of each run below a folder, named by its seed; a
+    second one of a seed also by its folder. Runs without an evaluation are left out, and what is no
+    run is, with a word. So are those of an old_view, which is a figure of its own."""
     runs = defaultdict(lambda: defaultdict(dict))
-    for path in sorted(folder.glob("*/settings.json")):
+    for path in sorted(folder.rglob("settings.json")):
+        place = path.parent.relative_to(folder)
+        if "old_view" in place.parts:
+            continue
         try:
-            settings, columns = read_run(path)
-        except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
-            print(f"{path.parent} is left out: {type(error).__name__} {error}", file=sys.stderr)
+            settings, columns = read_settings(path), read_metrics(path.with_name("metrics.csv"))
+        except (ValueError, OSError) as error:
+            print(error, file=sys.stderr)
             continue
-        if not columns:
-            continue
-        seeds = runs[settings["env"]][label(settings)]
-        if any(differ(columns, other, settings["action_repeat"]) for other in seeds.values()):
-            print(f"{path.parent} is left out: other steps than another seed's", file=sys.stderr)
-            continue
-        name = str(settings["seed"])
-        seeds[f"{name}, {path.parent.name}" if name in seeds else name] = columns
+        if columns:
+            env, experiment, name = settings
+            seeds = runs[env][experiment]
+            seeds[f"{name}, {place}" if name in seeds else name] = columns
     return runs
 
 
 def read_reference() -> dict[tuple[str, str], dict[str, str]]:
-    """{(env, policy): row} of what random and no actions earn."""
+    """{(env, policy): row} of what actions earn that look at nothing."""
     with open(HERE / "reference.csv", newline="") as file:
         return {(row["env"], row["policy"]): row for row in csv.DictReader(file)}
 
 
-def draw_curve(axes, seeds: dict[str, dict], column: str, name: str, color: str) -> None:
-    """One experiment's line: up to the last step that all of its seeds have reached."""
-    for run in seeds.values():
+def draw_curve(axes, runs: dict[str, dict], column: str, name: str, color: str) -> None:
+    """One experiment's mean where all of its runs were evaluated, at the first one's steps (others
+    on a straight line between theirs); each run as a thin line."""
+    for run in runs.values():
         mark = "o" if len(run[column]) == 1 else ""  # a line of one point is not seen
-        axes.plot(
-            run["env_steps"], run[column], color=color, alpha=0.35, linewidth=0.8, marker=mark
-        )
-    length = min(len(run[column]) for run in seeds.values())
-    values = np.stack([run[column][:length] for run in seeds.values()])
-    steps, mean = next(iter(seeds.values()))["env_steps"][:length], values.mean(0)
-    axes.plot(steps, mean, color=color, label=f"{name}, seeds: {len(seeds)}")
-    half = np.array([interval95(v) for v in values.T])
+        axes.plot(run["env_steps"], run[column], mark + "-", color=color, alpha=0.35, linewidth=0.8)
+    first, *_ = every = [run["env_steps"] for run in runs.values()]
+    # A hundredth either way: an evaluation may be a step late, where an episode ended.
+    low, high = 0.99 * max(steps[0] for steps in every), 1.01 * min(steps[-1] for steps in every)
+    steps = first[(first >= low) & (first <= high)]
+    values = np.stack([np.interp(steps, r["env_steps"], r[column]) for r in runs.values()])
+    mean, half = values.mean(0), np.array([interval95(v) for v in values.T])
+    axes.plot(steps, mean, color=color, label=f"{name}, runs: {len(runs)}")
     axes.fill_between(steps, mean - half, mean + half, color=color, alpha=0.12, linewidth=0)
 
 
@@ -123,73 +115,69 @@ def draw(path: Path, runs, reference) -> None:
     """Writes the figure."""
     names = dict.fromkeys([*ARMS, *sorted({name for arms in runs.values() for name in arms})])
     colors = {name: f"C{k}" for k, name in enumerate(names)}  # an arm has one colour everywhere
-    rows = {"eval_return": "evaluation return", "coverage": "coverage of states, nats"}
-    figure, panels = plt.subplots(
-        len(rows), len(runs), figsize=(5 * len(runs), 6), sharex="col", squeeze=False
-    )
-    for (env, arms), column_of_panels in zip(sorted(runs.items()), panels.T, strict=True):
-        for axes, (column, label) in zip(column_of_panels, rows.items(), strict=True):
-            for name, seeds in arms.items():
-                draw_curve(axes, seeds, column, name, colors[name])
-            every_value = np.concatenate([r[column] for seeds in arms.values()
-                                          for r in seeds.values()])  # fmt: skip
-            every_value = every_value[np.isfinite(every_value)]
-            if every_value.size:  # an interval over two seeds may leave the panel
-                margin = 0.1 * np.ptp(every_value) + 1
-                axes.set_ylim(every_value.min() - margin, every_value.max() + margin)
-            axes.set_ylabel(label)
-            if column == "eval_return":
-                for policy, style in POLICIES.items():
-                    if (env, policy) not in reference:
-                        continue
-                    earned = float(reference[env, policy]["return"])
-                    axes.axhline(earned, color="grey", linestyle=style, label=f"{policy} actions")
-                axes.set_title(env)
-        column_of_panels[0].legend(fontsize=8)
-        column_of_panels[-1].set_xlabel("environment steps")
-    figure.tight_layout()
+    figure = plt.figure(figsize=(5 * len(runs), 8), layout="constrained")
+    panels = figure.subplots(2, len(runs), sharex="col", squeeze=False)
+    for (env, arms), (above, below) in zip(sorted(runs.items()), panels.T, strict=True):
+        earned = {p: float(reference[env, p]["return"]) for p in POLICIES if (env, p) in reference}
+        for policy, value in earned.items():
+            above.axhline(
+                value, color="grey", linestyle=POLICIES[policy], label=f"{policy} actions"
+            )
+        for axes, column in ((above, "eval_return"), (below, "coverage")):
+            for name, of in arms.items():
+                draw_curve(axes, of, column, name, colors[name])
+            values = np.concatenate([run[column] for of in arms.values() for run in of.values()])
+            values = [*values[np.isfinite(values)], *(earned.values() if axes is above else ())]
+            if values:  # an interval over two runs may leave the panel
+                margin = 0.1 * np.ptp(values) + 1
+                axes.set_ylim(min(values) - margin, max(values) + margin)
+        above.set(title=env, ylabel="evaluation return")
+        below.set(xlabel="environment steps", ylabel="coverage of states, nats")
+        lines, labels = above.get_legend_handles_labels()
+        labels = [textwrap.fill(text, 60) for text in labels]  # there are arms with many changes
+        below.legend(lines, labels, fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.2))
     figure.savefig(path, dpi=90, metadata={"Software": None})
 
 
 def table(runs, reference) -> str:
     """A line a run: its last and its best evaluation, and what it covered on average."""
-    lines = [
-        "| environment | arm | seed | steps | minutes | last return | best return "
-        "| last length | mean coverage, nats |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    columns = (
+        "environment | arm | seed | steps | minutes | last return | best return | last length | "
+        "mean coverage, nats"
+    )
+    lines = [columns, " | ".join(9 * ["---"])]
     for env, arms in sorted(runs.items()):
         for policy in POLICIES:
-            if not (row := reference.get((env, policy))):
-                continue
-            lines.append(
-                f"| {env} | {policy} actions | – | – | – | {row['return']} ± {row['interval95']} "
-                f"| – | {row['length']} | – |"
-            )
-        for name, seeds in arms.items():
-            for seed, run in sorted(seeds.items()):
-                last = {column: values[-1] for column, values in run.items()}
-                lines.append(
-                    f"| {env} | {name} | {seed} | {last['env_steps']:,.0f} "
-                    f"| {last['wall_seconds'] / 60:.0f} | {last['eval_return']:.1f} "
-                    f"± {last['eval_interval95']:.1f} | {run['eval_return'].max():.1f} "
-                    f"| {last['eval_length']:.0f} | {run['coverage'].mean():.1f} |"
+            if row := reference.get((env, policy)):
+                earned = (
+                    f"– | – | – | {row['return']} ± {row['interval95']} | – | {row['length']} | –"
                 )
-    return "\n".join(lines) + "\n"
+                lines.append(f"{env} | {policy} actions | {earned}")
+        for name, of in arms.items():
+            for seed, run in sorted(of.items()):
+                last = {column: values[-1] for column, values in run.items()}
+                half = last["eval_interval95"]
+                spread = f" ± {half:.1f}" if np.isfinite(half) else ""  # of one episode: none
+                lines.append(
+                    f"{env} | {name} | {seed} | {last['env_steps']:,.0f} | "
+                    f"{last['wall_seconds'] / 60:.0f} | {last['eval_return']:.1f}{spread} | "
+                    f"{run['eval_return'].max():.1f} | {last['eval_length']:.0f} | "
+                    f"{run['coverage'].mean():.1f}"
+                )
+    return "".join(f"| {line} |\n" for line in lines)
 
 
 def main(arguments: list[str]) -> int:
     """Runs a command line. Returns the exit code: 0 done, 2 bad input."""
-    parser = argparse.ArgumentParser(
-        prog="python results/plot.py", description="Draws all runs in a folder: curves, table."
-    )
-    parser.add_argument("folder", type=Path, nargs="?", default=HERE, help="%(default)s")
+    says = "Draws all runs below a folder: its curves.png and table.md."
+    parser = argparse.ArgumentParser(prog="python results/plot.py", description=says)
+    parser.add_argument("folder", type=Path, nargs="?", default=HERE, help="runs (%(default)s)")
     folder = parser.parse_args(arguments).folder
     mpl.use("Agg")
     try:
         runs, reference = read_runs(folder), read_reference()
         if not runs:
-            raise ValueError(f"{folder} holds no evaluated run in a folder: nothing to draw.")
+            raise ValueError(f"{folder} holds no evaluated run: there is nothing to draw.")
         draw(folder / "curves.png", runs, reference)
         (folder / "table.md").write_text(table(runs, reference), encoding="utf-8")
     except (ValueError, OSError) as error:

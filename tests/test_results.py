@@ -6,6 +6,7 @@ import json
 import shutil
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
@@ -202,7 +203,7 @@ def write_run(folder: Path, rows: str, **changes) -> None:
     (folder / "settings.json").write_text(json.dumps(settings))
     lines = [f"{5000 * k},60,{r},1,9,2.5" for k, r in enumerate(rows.split(), 1)]
     names = "env_steps,wall_seconds,eval_return,eval_interval95,eval_length,coverage"
-    (folder / "metrics.csv").write_text("\n".join([names, *lines]) if lines else "")
+    (folder / "metrics.csv").write_text("".join(f"{x}\n" for x in [names, *lines]) if lines else "")
 
 
 def test_a_run_with_a_switch_of_its_own_is_another_line(tmp_path):
@@ -222,22 +223,58 @@ def test_an_environment_without_reference_is_drawn_too(tmp_path):
     assert "| HumanoidBulletEnv-v0 | maxent | 0 | 10,000 |" in (tmp_path / "table.md").read_text()
 
 
-def test_two_runs_of_one_seed_are_two_lines_and_both_count(tmp_path):
-    write_run(tmp_path / "a", "1 2")
-    write_run(tmp_path / "b", "3 4")
+def test_two_runs_of_one_seed_are_two_lines_and_both_count(tmp_path, capsys):
+    for name in ("a/run", "b/run", "b/c/run"):  # at any depth
+        write_run(tmp_path / name, "1 2")
     runs = plot.read_runs(tmp_path)["HopperBulletEnv-v0"]["maxent"]
-    assert list(runs) == ["0", "0, b"]
+    assert list(runs) == ["0", "0, b/c/run", "0, b/run"]
     assert plot.main([str(tmp_path)]) == 0
+    assert "| 0, b/run |" in capsys.readouterr().out
 
 
-def test_a_seed_that_cannot_be_averaged_is_left_out_with_a_word(tmp_path, capsys):
+def drawn(axes_lines: dict[str, dict]) -> tuple[np.ndarray, np.ndarray]:
+    """The points of the mean that is drawn of these runs."""
+    axes = plt.figure().subplots()
+    plot.draw_curve(axes, axes_lines, "eval_return", "maxent", "C0")
+    (mean,) = [line for line in axes.lines if line.get_label().startswith("maxent")]
+    plt.close("all")
+    return mean.get_xdata(), mean.get_ydata()
+
+
+def test_a_run_that_was_evaluated_at_other_steps_counts_between_them():
+    a = {"env_steps": np.array([5000, 10000, 15000]), "eval_return": np.array([1.0, 2, 3])}
+    b = {"env_steps": np.array([4000, 8000, 12000]), "eval_return": np.array([0.0, 4, 8])}
+    steps, mean = drawn({"0": a, "1": b})
+    assert steps.tolist() == [5000, 10000] and mean.tolist() == [(1 + 1) / 2, (2 + 6) / 2]
+    late = {"env_steps": np.array([5000, 10001, 15001]), "eval_return": np.array([3.0, 4, 5])}
+    steps, mean = drawn({"0": late, "1": a})  # a step late: the last point is drawn all the same
+    assert steps.tolist() == [5000, 10001, 15001] and mean[-1] == 4
+
+
+def test_runs_that_never_overlap_are_drawn_without_a_mean(tmp_path, capsys):
     write_run(tmp_path / "a", "1 2")
     write_run(tmp_path / "b", "1", seed=1)
     path = tmp_path / "b" / "metrics.csv"
-    path.write_text(path.read_text().replace("\n5000,", "\n7000,"))
+    path.write_text(path.read_text().replace("\n5000,", "\n70000,"))
     assert plot.main([str(tmp_path)]) == 0
-    said = capsys.readouterr()
-    assert "steps" in said.err and "maxent | 1 |" not in said.out
+    assert "maxent | 1 |" in capsys.readouterr().out
+
+
+def test_one_evaluation_of_one_episode_has_a_mark_and_no_interval(tmp_path, capsys):
+    write_run(tmp_path / "a", "7")
+    path = tmp_path / "a" / "metrics.csv"
+    path.write_text(path.read_text().replace("7,1,9", "7,nan,9"))
+    assert plot.main([str(tmp_path)]) == 0
+    assert "| 7.0 | 7.0 |" in capsys.readouterr().out
+
+
+def test_settings_of_another_version_are_named_by_what_they_hold(tmp_path):
+    write_run(tmp_path / "old", "1 2")
+    path = tmp_path / "old" / "settings.json"
+    settings = json.loads(path.read_text()) | {"device": "cuda", "run_dir": "x", "warp": 3}
+    del settings["floor_brightness"]  # the old one did not have it: it was not changed
+    path.write_text(json.dumps(settings))
+    assert list(plot.read_runs(tmp_path)["HopperBulletEnv-v0"]) == ["maxent, warp 3"]
 
 
 def test_coverage_that_is_unknown_leaves_the_returns_drawn(tmp_path):
@@ -250,7 +287,8 @@ def test_coverage_that_is_unknown_leaves_the_returns_drawn(tmp_path):
 @pytest.mark.parametrize("file, content", [
     ("settings.json", ""), ("settings.json", "[]"), ("settings.json", "{}"),
     ("settings.json", '{"arm": "warp", "preset": "small"}'), ("settings.json", '{"arm"'),
-    ("metrics.csv", "a,b\n1,2\n"), ("metrics.csv", "env_steps\nmany\n"),
+    ("settings.json", '{"arm": [], "preset": "small"}'), ("metrics.csv", "a,b\n1,2\n"),
+    ("metrics.csv", "env_steps\nmany\n"), ("metrics.csv", "\0\n\xff\n"),
 ])  # fmt: skip
 def test_what_is_no_run_is_left_out_with_a_word(file, content, tmp_path, capsys):
     write_run(tmp_path / "a", "1 2")
@@ -259,29 +297,31 @@ def test_what_is_no_run_is_left_out_with_a_word(file, content, tmp_path, capsys)
     assert plot.main([str(tmp_path)]) == 0
     said = capsys.readouterr()
     assert "maxent | 0 |" in said.out and "maxent | 1 |" not in said.out
-    assert len(said.err.splitlines()) == 1 and str(tmp_path / "b") in said.err
+    assert len(said.err.splitlines()) == 1 and str(tmp_path / "b" / file) in said.err
 
 
-def test_a_row_that_is_half_written_is_left_out(tmp_path, trained):
+@pytest.mark.parametrize("cut", [1, 2, 8])
+def test_a_row_that_is_half_written_is_left_out(tmp_path, cut):
     write_run(tmp_path / "a", "1 2 3")
     path = tmp_path / "a" / "metrics.csv"
-    path.write_text(path.read_text()[:-8])
-    (columns,) = plot.read_runs(tmp_path)["HopperBulletEnv-v0"]["maxent"].values()
-    assert columns["eval_return"].tolist() == [1, 2]
-    assert len(diagnose.read_metrics(tmp_path / "a")) == 2
-    assert diagnose.read_metrics(tmp_path) == []
+    path.write_text(path.read_text()[:-cut])
+    assert plot.read_metrics(path)["eval_return"].tolist() == [1, 2]
+    assert plot.read_metrics(tmp_path / "none yet") == {}
 
 
 def test_committed_runs_give_the_committed_table(tmp_path):
-    for name in ("", "old_view", "old_view/20k"):
-        folder = tmp_path / name.replace("/", "-") / "runs"
-        for path in (RESULTS / name).glob("*/settings.json"):
-            shutil.copytree(path.parent, folder / path.parent.name)
+    for name in ("", "old_view"):
+        folder = tmp_path / "runs" / name
+        for path in (RESULTS / name).rglob("settings.json"):
+            place = path.parent.relative_to(RESULTS / name)
+            if name or "old_view" not in place.parts:
+                shutil.copytree(path.parent, folder / place)
         if not folder.exists():
             continue
         assert plot.main([str(folder)]) == 0
         assert (folder / "table.md").read_text() == (RESULTS / name / "table.md").read_text()
         assert (folder / "curves.png").stat().st_size > 10_000
+    assert folder.name == "old_view"
 
 
 def test_committed_runs_are_of_this_programs_settings():
