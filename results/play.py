@@ -2,8 +2,9 @@
 
     python results/play.py runs/NAME --video
 
-prints the returns of fresh episodes and draws the best of them, strip.png: the episode, what the
-model sees of it, and what it dreams after its first five images. The run may still be going on.
+prints the returns of fresh episodes and draws the best of them in the run's folder, as
+strip-STEP.png: the episode, what the model sees of it, and what it dreams after its first five
+images; with --video as episode-STEP.gif too. The run may still be going on.
 """
 
 import argparse
@@ -15,17 +16,9 @@ import torch
 from PIL import Image, ImageDraw
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+import train
 from actors import Episode, play
 from env import EnvironmentFault, make_env
-from train import (
-    Agent,
-    Patient,
-    interval95,
-    load_networks,
-    make_agent,
-    read_checkpoint,
-    read_settings,
-)
 
 SHORTEST = 20  # milliseconds: browsers show a GIF's frame no shorter
 
@@ -36,25 +29,25 @@ def load(folder: Path, checkpoint: str, device: str, precision: str):
     Raises:
         ValueError: in one sentence, if the folder holds none, or not for this machine.
     """
-    s = read_settings(folder)
+    s = train.read_settings(folder)
     env = make_env(s.env, s.action_repeat, s.camera_distance, s.floor_brightness)
-    agent = make_agent(s, env, device, precision)
+    agent = train.make_agent(s, env, device, precision)
     if checkpoint == "newest":
-        saved = read_checkpoint(folder)[1]
-        load_networks(agent, saved["agent"])
-        return s, env, agent, f"{saved['kept']['step']}"
-    path = folder / "best.pt"
-    if not path.exists():
+        saved = train.read_checkpoint(folder)[1]
+        weights, name = saved["agent"], f"{saved['kept']['step']}"
+    elif (path := folder / "best.pt").exists():
+        try:
+            weights, name = torch.load(path, map_location="cpu", weights_only=True), "best"
+        except Exception as error:  # damage has many
+            raise ValueError(f"{path} is damaged: {type(error).__name__}.") from None
+    else:
         raise ValueError(f"{folder} was not evaluated yet: it has no best.pt.")
-    try:
-        load_networks(agent, torch.load(path, map_location="cpu", weights_only=True))
-    except Exception as error:  # damage has many
-        raise ValueError(f"{path} is damaged: {type(error).__name__}.") from None
-    return s, env, agent, "best"
+    train.load_networks(agent, weights)
+    return s, env, agent, name
 
 
 @torch.no_grad()
-def open_loop(agent: Agent, episode: Episode, frames: int, context: int = 5) -> np.ndarray:
+def open_loop(agent: train.Agent, episode: Episode, frames: int, context: int = 5) -> np.ndarray:
     """What the model dreams when it sees `context` images and then only the actions taken.
 
     Returns:
@@ -92,36 +85,33 @@ def film(path: Path, pictures: np.ndarray, fps: float) -> None:
         for column, label in enumerate(("truth", "dream after 5 images", "difference")):
             ImageDraw.Draw(image).text((128 * column + 4, 0), label, "white")
         frames.append(image)
-    mosaic = Image.fromarray(
-        np.concatenate([np.asarray(f) for f in frames[:: len(frames) // 10 + 1]])
-    )
-    palette = mosaic.quantize(128)  # of the whole film: a frame's own would leave out rare colours
+    some = np.concatenate([np.asarray(f) for f in frames[:: len(frames) // 10 + 1]])
+    palette = Image.fromarray(some).quantize(128)  # a frame's own would leave out rare colours
     frames = [f.quantize(palette=palette, dither=Image.Dither.NONE) for f in frames]
-    frames[0].save(
-        path, save_all=True, append_images=frames[1:], duration=1000 * every / fps, loop=0
-    )
+    # A GIF counts hundredths of a second: rounded one by one, 33 ms would be 30.
+    shown = np.diff(np.rint(np.arange(len(frames) + 1) * 100 * every / fps) * 10).tolist()
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=shown, loop=0)
 
 
-def show(folder: Path, command: argparse.Namespace) -> None:
-    """Plays, prints and draws.
-
-    Raises:
-        ValueError: in one sentence, if there is nothing to play.
-        EnvironmentFault: if the environment fails.
-    """
+def show(command: argparse.Namespace) -> None:
+    """Plays, prints and draws. A ValueError, in one sentence, if there is nothing to play."""
     if command.episodes < 1:
         raise ValueError(f"--episodes is {command.episodes}: give 1 or more.")
+    folder = command.folder
     s, env, agent, name = load(folder, command.checkpoint, command.device, command.precision)
-    actor = agent.evaluated if command.actor == "evaluated" else agent.actors["stochastic"]
+    if command.actor not in ("evaluated", *agent.actors):
+        raise ValueError(f"{folder} has no {command.actor} actor: leave out --actor.")
+    actor = agent.evaluated if command.actor == "evaluated" else agent.actors[command.actor]
     seeds = [2**31 - 1 - k for k in range(command.episodes)]  # those of every evaluation
     episodes = [play(agent, env, actor.mode, seed, s.eval_max_steps) for seed in seeds]
     returns, lengths = np.array([(e.total, e.length) for e in episodes]).T
-    spread = f" ± {interval95(returns):.1f} (95% interval)" if len(returns) > 1 else ""
+    spread = f" ± {train.interval95(returns):.1f} (95% interval)" if len(returns) > 1 else ""
     print(
         f"{s.env}, arm {s.arm}, networks {name}, {command.actor} actor's mode: return "
         f"{returns.mean():.1f}{spread}, {lengths.mean():.0f} environment steps an episode"
     )
-    print("returns:", *(f"{one:.1f}" for one in returns))
+    each = (f"{r:.1f} ({n:.0f})" for r, n in zip(returns, lengths, strict=True))
+    print("returns (and lengths):", *each)
     best = episodes[returns.argmax()]
     seen, dreamt = open_loop(agent, best, 10_000, 10_000), open_loop(agent, best, frames=25)
     path = folder / f"strip-{name}.png"
@@ -133,39 +123,34 @@ def show(folder: Path, command: argparse.Namespace) -> None:
         print(f"{path}: truth, dream from its first 5 images and the actions taken, difference")
 
 
+def command_line(program: str, says: str, episodes: int) -> argparse.ArgumentParser:
+    """What this and diagnose.py take: a run's folder, and how to play it."""
+    parser = argparse.ArgumentParser(prog=f"python results/{program}", description=says)
+    add, which = parser.add_argument, "its newest networks, or its best evaluation's (%(default)s)"
+    add("folder", type=Path, help="a run's folder, runs/NAME; it may still be going on")
+    add("--episodes", type=int, default=episodes, help="of an actor (%(default)s)")
+    add("--checkpoint", choices=("newest", "best"), default="newest", help=which)
+    add("--device", choices=("auto", "cpu", "cuda"), default="auto")
+    add("--precision", choices=("auto", "bfloat16", "float32"), default="auto")
+    return parser
+
+
 def main(arguments: list[str]) -> int:
     """Runs a command line. Returns the exit code: 0 done, 1 the environment failed, 2 bad input."""
-    parser = argparse.ArgumentParser(
-        prog="python results/play.py", description="Plays the networks of a run."
-    )
-    parser.add_argument("folder", type=Path, help="a run's folder, runs/NAME")
-    parser.add_argument("--episodes", type=int, default=10, help="how many (%(default)s)")
-    actors = "the one that evaluations play, or the explorer (%(default)s)"
-    parser.add_argument(
-        "--actor", choices=("evaluated", "stochastic"), default="evaluated", help=actors
-    )
-    parser.add_argument("--video", action="store_true", help="an animated GIF of the best episode")
-    add_loading(parser)
-    command = parser.parse_args(arguments)
+    parser = command_line("play.py", "Plays the networks of a run.", episodes=10)
+    known = ("evaluated", "stochastic", "deterministic")
+    which = "by its mode; evaluated: the one that evaluations play (%(default)s)"
+    parser.add_argument("--actor", choices=known, default="evaluated", help=which)
+    which = "the beginning of the best episode as an animated GIF"
+    parser.add_argument("--video", action="store_true", help=which)
     try:
-        show(command.folder, command)
-    except (ValueError, OSError) as error:
+        show(parser.parse_args(arguments))
+    except (ValueError, OSError, EnvironmentFault) as error:
         print(error, file=sys.stderr)
-        return 2
-    except EnvironmentFault as error:
-        print(error, file=sys.stderr)
-        return 1
+        return 1 if isinstance(error, EnvironmentFault) else 2
     return 0
 
 
-def add_loading(parser: argparse.ArgumentParser) -> None:
-    """The options of `load`."""
-    which = "its newest networks, or those of its best evaluation (%(default)s)"
-    parser.add_argument("--checkpoint", choices=("newest", "best"), default="newest", help=which)
-    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
-    parser.add_argument("--precision", choices=("auto", "bfloat16", "float32"), default="auto")
-
-
 if __name__ == "__main__":
-    sys.stdout, sys.stderr = Patient(sys.stdout), Patient(sys.stderr)
+    sys.stdout, sys.stderr = train.Patient(sys.stdout), train.Patient(sys.stderr)
     sys.exit(main(sys.argv[1:]))

@@ -6,6 +6,7 @@ import json
 import shutil
 from pathlib import Path
 
+import gymnasium as gym
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ import results.diagnose as diagnose
 import results.play as play
 import results.plot as plot
 from actors import Episode
+from env import EnvironmentFault, make_env
 from train import Agent, Settings, default_settings, main
 
 TINY = dict(
@@ -90,11 +92,66 @@ def test_a_run_is_diagnosed_and_left_as_it_is(tmp_path, capsys):
     options = [f"--{name.replace('_', '-')}={value}" for name, value in TINY.items()]
     assert main(["--run-dir", str(folder), *options]) == 0
     before = {path: path.read_bytes() for path in folder.iterdir()}
+    capsys.readouterr()
     assert diagnose.main([str(folder), "--episodes", "1"]) == 0
     page = folder / "diagnosis-120.png"
     assert page.stat().st_size > 10_000
     assert {path: path.read_bytes() for path in folder.iterdir() if path != page} == before
-    assert "deterministic" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "deterministic" in said.out and not said.err
+    for metrics in ("env_steps,eval_return\n60,", "a\n1\n", ""):  # half written, foreign, empty
+        (folder / "metrics.csv").write_text(metrics)
+        assert diagnose.main([str(folder), "--episodes", "1", "--checkpoint", "best"]) == 0
+    (folder / "metrics.csv").unlink()
+    assert diagnose.main([str(folder), "--episodes", "1"]) == 0
+
+
+@pytest.mark.parametrize("length, terminated", [(1, True), (1, False), (15, False), (16, True)])
+def test_short_episodes_are_diagnosed_and_drawn(length, terminated, tmp_path):
+    agent = Agent(Settings(**TINY), actions=3, device=torch.device("cpu"), bfloat16=False)
+    episode = made_up_episode(length, terminated)
+    episode = episode._replace(states=torch.zeros(length, agent.model.size))
+    found = diagnose.measure(agent, "stochastic", episode)
+    assert ("open_reward" in found) == (length > 15)
+    assert "Look first" in diagnose.verdict({"stochastic": diagnose.figures(found, [episode])})
+    played = {"stochastic": [episode]}
+    diagnose.draw(tmp_path / "page.png", agent, played, {"stochastic": found}, {})
+    for context in (5, 10_000):
+        assert play.open_loop(agent, episode, 25, context).shape[:2] == (3, min(length, 25))
+    play.film(tmp_path / "a.gif", play.open_loop(agent, episode, 150), fps=30)
+
+
+@pytest.mark.parametrize("repeat", [1, 3])
+def test_the_part_for_being_alive_is_that_of_each_decision(repeat):
+    env = make_env("HopperBulletEnv-v0", repeat)
+    alive = diagnose.watch_alive(env)
+    env.reset(seed=0)
+    done, decisions, steps = False, [], 0
+    while not done:  # it falls; at −1 a step once it lies
+        _, reward, done, _, info = env.step(np.ones(3, np.float32))
+        decisions.append(reward)
+        steps = info["episode"]["l"] if done else steps
+    assert len(alive) == steps and alive[0] == 1 and alive[-1] == -1
+    rest = sum(env.unwrapped.rewards[1:])  # of the last physics step, which is all that is kept
+    if repeat == 1:
+        assert decisions[-1] == pytest.approx(alive[-1] + rest)
+    assert diagnose.watch_alive(gym.Env()) == []
+
+
+def test_what_the_part_for_being_alive_explains_is_told_apart():
+    """Of rewards 1 or −1 and as much beside it, half of the variance is of being alive; a model
+    that predicts the rest alone is wrong by just that part."""
+    alive, rest = np.array([1.0, 1, -1, -1]), np.array([1.0, -1, 1, -1])
+    episode = made_up_episode(4, terminated=True)
+    found = {
+        "reward": np.stack([rest, alive + rest], -1), "terminated": np.zeros((4, 2)),
+        "return": np.zeros((0, 2)), "saturated": np.zeros((4, 3)), "greedy": np.zeros((4, 3)),
+        "seen_image": np.zeros(4), "alive": alive,
+    }  # fmt: skip
+    named = diagnose.figures(found, [episode])
+    assert named[diagnose.ALIVE] == pytest.approx(0.5)
+    assert named[diagnose.BLIND] == pytest.approx(1)
+    assert diagnose.ALIVE not in diagnose.figures(found | {"alive": np.ones(4)}, [episode])
 
 
 def test_what_is_seen_and_what_is_dreamt_are_held_apart():
@@ -113,7 +170,7 @@ def test_what_is_seen_and_what_is_dreamt_are_held_apart():
 
 GOOD = {
     diagnose.REWARDS: 0.9, diagnose.DEVIATION: 0.4, diagnose.ENDS: 5, diagnose.EXPECTED: 4.5,
-    diagnose.PROMISED: 100, diagnose.EARNED: 95, diagnose.AFTER: 0.6,
+    diagnose.PROMISED: 100, diagnose.EARNED: 95, diagnose.AFTER: 0.6, diagnose.DECISIONS: 500,
 }  # fmt: skip
 
 
@@ -123,6 +180,8 @@ GOOD = {
     ({diagnose.DEVIATION: 0.01, diagnose.REWARDS: -7}, "the same whatever it sees"),
     ({diagnose.EXPECTED: 1}, "see ends coming"),
     ({diagnose.EXPECTED: 30}, "do not come"),
+    ({diagnose.EXPECTED: 3, diagnose.ENDS: 0}, "do not come"),  # of 500
+    ({diagnose.EXPECTED: 3, diagnose.ENDS: 0, diagnose.DECISIONS: 2500}, "Nothing stands out"),
     ({diagnose.PROMISED: 200}, "promised than earned"),
     ({diagnose.PROMISED: -20, diagnose.EARNED: -90}, "promised than earned"),
     ({diagnose.AFTER: -0.5}, "dynamics are weak"),
@@ -169,10 +228,47 @@ def test_train_py_evaluates_by_it(trained, tmp_path, capfd):
         assert len(capfd.readouterr().err.strip().splitlines()) == 1
 
 
-def test_one_episode_has_no_interval(trained, capsys):
-    assert play.main([str(trained), "--episodes", "1", "--actor", "stochastic"]) == 0
+@pytest.mark.parametrize("actor", ["stochastic", "deterministic"])
+def test_one_episode_has_no_interval(trained, actor, capsys):
+    assert play.main([str(trained), "--episodes", "1", "--actor", actor]) == 0
     said = capsys.readouterr().out
-    assert "±" not in said and "nan" not in said
+    assert "±" not in said and "nan" not in said and f"{actor} actor" in said
+
+
+def test_networks_that_are_not_there_or_damaged_are_named_in_a_sentence(tmp_path, capsys):
+    options = [f"--{name.replace('_', '-')}={value}" for name, value in TINY.items()]
+    folder = tmp_path / "run"
+    assert main(["--run-dir", str(folder), "--arm", "revised", *options]) == 0
+    capsys.readouterr()
+    for arguments in (["--actor", "deterministic"], ["--device", "cuda"], ["--checkpoint", "best"]):
+        (folder / "best.pt").write_bytes(b"x")
+        assert play.main([str(folder), "--episodes", "1", *arguments]) == 2
+        assert len(capsys.readouterr().err.strip().splitlines()) == 1
+    (folder / "best.pt").unlink()
+    assert play.main([str(folder), "--checkpoint", "best"]) == 2
+    assert "not evaluated yet" in capsys.readouterr().err
+
+
+def test_an_environment_that_fails_ends_with_its_own_sentence(trained, capsys, monkeypatch):
+    def fails(*_):
+        raise EnvironmentFault("Hopper raised a fault.")
+
+    for program in (play, diagnose):
+        monkeypatch.setattr(program, "play", fails)
+        assert program.main([str(trained)]) == 1
+        assert capsys.readouterr().err == "Hopper raised a fault.\n"
+
+
+@pytest.mark.parametrize("fps", [30, 50, 70, 12.5])
+def test_a_film_lasts_as_long_as_what_it_shows(fps, tmp_path):
+    pictures = np.random.default_rng(0).integers(0, 256, (3, 60, 64, 64, 3), np.uint8)
+    play.film(tmp_path / "a.gif", pictures, fps)
+    with Image.open(tmp_path / "a.gif") as gif:
+        shown = []
+        for k in range(gif.n_frames):
+            gif.seek(k)
+            shown.append(gif.info["duration"])
+    assert min(shown) >= play.SHORTEST and sum(shown) == pytest.approx(60_000 / fps, abs=10)
 
 
 def test_a_film_keeps_real_time_and_its_colours(tmp_path):
