@@ -2,9 +2,9 @@
 
     python results/diagnose.py runs/NAME
 
-plays fresh episodes with each actor of the newest checkpoint, and holds what the model says of them
-against what happened. Prints the figures and draws diagnosis-STEP.png in the run's folder. The run
-may still be going on: nothing of it is changed.
+plays fresh episodes with each actor, and holds what the model says of them against what happened.
+Prints the figures and a verdict, and draws diagnosis-STEP.png in the run's folder. The run may
+still be going on: nothing of it is changed.
 """
 
 import argparse

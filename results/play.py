@@ -20,28 +20,27 @@ import train
 from actors import Episode, play
 from env import EnvironmentFault, make_env
 
+ACTORS = ("stochastic", "deterministic")
 SHORTEST = 20  # milliseconds: browsers show a GIF's frame no shorter
 
 
 def load(folder: Path, checkpoint: str, device: str, precision: str):
-    """A run's settings, environment and agent, and what its networks are called.
-
-    Raises:
-        ValueError: in one sentence, if the folder holds none, or not for this machine.
-    """
+    """A run's settings, environment and agent, and what its networks are called. A ValueError, in
+    one sentence, if the folder holds none, or not for this machine."""
     s = train.read_settings(folder)
     env = make_env(s.env, s.action_repeat, s.camera_distance, s.floor_brightness)
     agent = train.make_agent(s, env, device, precision)
     if checkpoint == "newest":
         saved = train.read_checkpoint(folder)[1]
         weights, name = saved["agent"], f"{saved['kept']['step']}"
-    elif (path := folder / "best.pt").exists():
+    else:
         try:
-            weights, name = torch.load(path, map_location="cpu", weights_only=True), "best"
+            path, name = folder / "best.pt", "best"
+            weights = torch.load(path, map_location="cpu", weights_only=True)
+        except FileNotFoundError:
+            raise ValueError(f"{folder} was not evaluated yet: it has no best.pt.") from None
         except Exception as error:  # damage has many
             raise ValueError(f"{path} is damaged: {type(error).__name__}.") from None
-    else:
-        raise ValueError(f"{folder} was not evaluated yet: it has no best.pt.")
     train.load_networks(agent, weights)
     return s, env, agent, name
 
@@ -120,7 +119,7 @@ def show(command: argparse.Namespace) -> None:
     if command.video:
         path = folder / f"episode-{name}.gif"
         film(path, open_loop(agent, best, frames=150), env.metadata["render_fps"])
-        print(f"{path}: truth, dream from its first 5 images and the actions taken, difference")
+        print(f"{path}: the episode, dream from its first 5 images and its actions, difference")
 
 
 def command_line(program: str, says: str, episodes: int) -> argparse.ArgumentParser:
@@ -138,11 +137,9 @@ def command_line(program: str, says: str, episodes: int) -> argparse.ArgumentPar
 def main(arguments: list[str]) -> int:
     """Runs a command line. Returns the exit code: 0 done, 1 the environment failed, 2 bad input."""
     parser = command_line("play.py", "Plays the networks of a run.", episodes=10)
-    known = ("evaluated", "stochastic", "deterministic")
-    which = "by its mode; evaluated: the one that evaluations play (%(default)s)"
-    parser.add_argument("--actor", choices=known, default="evaluated", help=which)
-    which = "the beginning of the best episode as an animated GIF"
-    parser.add_argument("--video", action="store_true", help=which)
+    add, which = parser.add_argument, "by its mode; evaluated: evaluations' own (%(default)s)"
+    add("--actor", choices=("evaluated", *ACTORS), default="evaluated", help=which)
+    add("--video", action="store_true", help="the best episode's beginning as an animated GIF")
     try:
         show(parser.parse_args(arguments))
     except (ValueError, OSError, EnvironmentFault) as error:

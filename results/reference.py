@@ -2,16 +2,15 @@
 
     python results/reference.py
 
-writes results/reference.csv: ten episodes each, with the seeds of every evaluation; mean return,
-half its 95% interval, mean length in environment steps. The best constant action is a corner of
-the action box: of all, the eight that earn most in two episodes, of these, the one that does in
-ten (of other seeds). An agent that holds a pose has learnt no more than that. Rewards do not
-depend on images, so none are rendered.
+writes results/reference.csv: mean return of ten episodes with the seeds of every evaluation, half
+its 95% interval, mean length in environment steps. The best constant action is a corner of the
+action box: of all, the eight that earn most in two episodes (of other seeds), of these, the one
+that does in ten. An agent that holds a pose has learnt no more. Rewards do not depend on images,
+so none are rendered.
 """
 
 import itertools
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import gymnasium as gym
@@ -22,10 +21,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import env  # registers the PyBullet environments
 from train import Settings, interval95
 
-ENVIRONMENTS = ("Hopper", "Walker2D", "HalfCheetah", "Ant")
 
-
-def episode(world: gym.Env, seed: int, policy: Callable[[], np.ndarray]) -> tuple[float, int]:
+def episode(world: gym.Env, seed: int, policy) -> tuple[float, int]:
     """Return and length of an episode of actions in [−1, 1] that look at nothing."""
     world.reset(seed=seed)
     over = False
@@ -35,8 +32,8 @@ def episode(world: gym.Env, seed: int, policy: Callable[[], np.ndarray]) -> tupl
     return info["episode"]["r"], info["episode"]["l"]
 
 
-def policies(world: gym.Env) -> dict[str, Callable[[], np.ndarray]]:
-    """The three, by name."""
+def policies(world: gym.Env) -> dict:
+    """{name: what gives the next action}."""
     size, rng = world.action_space.shape[0], np.random.default_rng(0)
     corners = [np.array(corner) for corner in itertools.product((-1.0, 1.0), repeat=size)]
 
@@ -46,11 +43,8 @@ def policies(world: gym.Env) -> dict[str, Callable[[], np.ndarray]]:
     some = sorted(corners, key=lambda corner: earned(corner, 2))[-8:]
     best = max(some, key=lambda corner: earned(corner, 10))
     print(world.spec.id, "constant", best)
-    return {
-        "random": lambda: rng.uniform(-1, 1, size),
-        "zero": lambda: np.zeros(size),
-        "constant": lambda: best,
-    }
+    random, zero = (lambda: rng.uniform(-1, 1, size)), (lambda: np.zeros(size))
+    return {"random": random, "zero": zero, "constant": lambda: best}
 
 
 def make(name: str) -> gym.Env:
@@ -64,7 +58,7 @@ def make(name: str) -> gym.Env:
 
 if __name__ == "__main__":
     lines = ["env,policy,return,interval95,length"]
-    for name in ENVIRONMENTS:
+    for name in ("Hopper", "Walker2D", "HalfCheetah", "Ant"):
         world = make(name)
         for policy, act in policies(world).items():
             played = [episode(world, 2**31 - 1 - k, act) for k in range(10)]

@@ -16,6 +16,7 @@ from PIL import Image
 import results.diagnose as diagnose
 import results.play as play
 import results.plot as plot
+import results.reference as reference
 from actors import Episode
 from env import EnvironmentFault, make_env
 from train import Agent, Settings, default_settings, main
@@ -418,6 +419,21 @@ def test_committed_runs_give_the_committed_table(tmp_path):
         assert (folder / "table.md").read_text() == (RESULTS / name / "table.md").read_text()
         assert (folder / "curves.png").stat().st_size > 10_000
     assert folder.name == "old_view"
+
+
+def test_references_earn_what_the_agents_environment_gives():
+    action, world = np.ones(3), reference.make("Hopper")
+    env = make_env("HopperBulletEnv-v0", Settings.action_repeat, floor_brightness=0.4)
+    for seed in (2**31 - 1, 3):
+        earned, length = reference.episode(world, seed, lambda: action)
+        env.reset(seed=seed)
+        rewards, over = [], False
+        while not over:
+            _, reward, over, _, info = env.step(action.astype(np.float32))
+            rewards.append(reward)
+        assert earned == pytest.approx(sum(rewards)) and length == info["episode"]["l"]
+    names = {f"{name}BulletEnv-v0" for name in ("Hopper", "Walker2D", "HalfCheetah", "Ant")}
+    assert plot.read_reference().keys() == {(env, p) for env in names for p in plot.POLICIES}
 
 
 def test_committed_runs_are_of_this_programs_settings():
