@@ -99,7 +99,7 @@ def make(folder: Path, command: argparse.Namespace, ends: list[int]) -> str:
         return ""
     log, told, recorded = folder.with_name(folder.name + ".log"), 0, False
     with open(log, "a") if command.index is None else contextlib.nullcontext() as file:
-        process = start(folder, command.runs[folder], file)
+        before, process = file and file.tell(), start(folder, command.runs[folder], file)
     while process.poll() is None:
         time.sleep(0.5)
         recorded = recorded or record(folder, process.pid)
@@ -108,11 +108,11 @@ def make(folder: Path, command: argparse.Namespace, ends: list[int]) -> str:
             told += 1
     if ends or steps_made(folder, command.steps) == command.steps:
         return ""
-    said = "".join(log.read_text(errors="replace").splitlines()[-1:]) if file else ""
-    if re.search("is in use by|is there already", said) and (folder / "settings.json").exists():
+    said = log.read_bytes()[before:].decode(errors="replace").splitlines() if file else []
+    if re.search("in use by|is there already", str(said)) and (folder / "settings.json").exists():
         tqdm.write(f"{folder} is another process's, and left to it.", sys.stderr)
         return ""
-    return f"{folder.name} failed with exit code {process.returncode}: {said or 'see above'}"
+    return ": ".join([f"{folder.name} failed with exit code {process.returncode}", *said[-1:]])
 
 
 def main(arguments: list[str]) -> int:
@@ -136,7 +136,7 @@ def main(arguments: list[str]) -> int:
             bar.total = sum(n if work[f].done() else command.steps for f, n in made.items())
             bar.update(sum(made.values()) - bar.n)
     drawn = plot.main([str(command.out)]) if command.index is None else 0
-    failed = [w.exception() or w.result() for w in work.values() if w.exception() or w.result()]
+    failed = [why for w in work.values() if (why := w.exception() or w.result())]
     for why in failed:
         train.say(why)
     if ends:

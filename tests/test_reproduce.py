@@ -30,6 +30,9 @@ with open(folder.with_name("calls"), "a") as calls:
     print(how, folder.name, words["--steps"], os.environ["OMP_NUM_THREADS"], file=calls)
 if "Fails" in folder.name:
     sys.exit("There is no such thing.")
+if "Taken" in folder.name:  # its owner, whose first caller is gone, has the same log
+    print(f"{folder} is in use by process 7: stop it.\\n 40%|####  |", flush=True)
+    sys.exit(2)
 if "Slow" in folder.name:
     def end(number, _):
         folder.with_name("told").write_text(signal.Signals(number).name)
@@ -172,6 +175,14 @@ def test_a_failure_stops_no_other_run_and_is_listed_with_its_last_words(stand_in
     assert any("200k/200k" in line for line in said)  # none of theirs is waited for
     assert len(list(stand_in.glob(f"{HOPPER}*/weights.pt"))) == 2
     assert len(list(stand_in.glob("*.log"))) == 4
+
+
+def test_a_run_of_another_process_is_no_failure_though_that_one_writes_to_its_log(stand_in, capsys):
+    folder = stand_in / "Taken-v0-maxent-seed0"
+    write_run(folder, 1000, "settings.json")
+    arguments = ["--arms", "maxent", "--envs", "Taken-v0", "--seeds", "0", "--out", str(stand_in)]
+    assert reproduce.main(arguments) == 0
+    assert f"{folder} is another process's, and left to it." in capsys.readouterr().err
 
 
 def test_one_of_them_alone_by_its_index_in_the_foreground(stand_in, capfd, monkeypatch):
