@@ -24,15 +24,14 @@ from world_model import mlp
 class StochasticActor(nn.Module):
     """π(a | s) = tanh(Normal(μ, σ)), as in Dreamer.
 
-        μ = 5 tanh(x / 5),   σ = softplus(y + log(e⁵ − 1)) + min_std
+        μ = 5 tanh(x / 5),   σ = softplus(y + log(e⁵ − 1)) + 1e-4
 
-    σ is near 5 at first: the untrained policy plays all actions, mostly the extreme ones. min_std
-    is 1e-4 in Dreamer; a larger one keeps an explorer from becoming a deterministic actor.
+    σ is near 5 at first: the untrained policy plays all actions, mostly the extreme ones.
     """
 
-    def __init__(self, size: int, actions: int, units: int, layers: int = 4, min_std: float = 1e-4):
+    def __init__(self, size: int, actions: int, units: int, layers: int = 4):
         super().__init__()
-        self.net, self.min_std = mlp(size, units, layers, 2 * actions), min_std
+        self.net = mlp(size, units, layers, 2 * actions)
 
     def raw(self, state: Tensor) -> Tensor:
         """x, what the bounds act on: (…, D) -> (…, A)."""
@@ -41,7 +40,7 @@ class StochasticActor(nn.Module):
     def distribution(self, state: Tensor) -> Normal:
         """The distribution before the tanh, in float32: (…, D) -> Normal of (…, A)."""
         mean, std = self.net(state).chunk(2, -1)
-        std = F.softplus(std + math.log(math.exp(5) - 1)) + self.min_std
+        std = F.softplus(std + math.log(math.exp(5) - 1)) + 1e-4
         return Normal(5 * torch.tanh(mean / 5), std, validate_args=False)
 
     def forward(self, state: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
     python train.py --env HopperBulletEnv-v0
 
 `update` is the paper's algorithm and `train` its loop; what they call follows in the order in which
-they call it. No other file reads settings, holds an optimiser, moves a device or writes to disk.
+they call it. No other file reads settings, holds an optimiser or knows a run's folder.
 """
 
 import contextlib
@@ -18,6 +18,7 @@ import shlex
 import shutil
 import signal
 import socket
+import subprocess
 import sys
 import threading
 import time
@@ -113,7 +114,6 @@ class Settings:
     target_rate: Share = 0.1  # soft update of the target MDN (§5)
     first_action_noise: Amount = 0.1  # on the deterministic actor's first imagined action (ours)
     detach_policy: bool = True  # no gradient through what the policy sees in its dream (Dreamer)
-    actor_min_std: Amount = 1e-4  # floor under the explorer's σ, before its tanh (Dreamer)
     action_penalty: Amount = 0.0  # on actions squared before their tanh, lest it saturate (ours)
     model_lr: Amount = 6e-4  # Adam's learning rate of the world model (Dreamer)
     actor_lr: Amount = 8e-5  # of each actor (Dreamer)
@@ -148,7 +148,6 @@ PRESETS = {
         deter=128, stoch=64, hidden=128, units=128, depth=16, batch_size=20, length=25,
         mdn_units=128, prefill=2000, starts=0.5, floor_brightness=0.4, reward_weight=20.0,
         squared_reward=True, action_penalty=0.01, beta_share=True,
-        actor_min_std=0.3,
     ),
     "paper": dict(steps=1_000_000, train_every=1000, updates=100),
 }
@@ -234,7 +233,6 @@ def update_actor(
         loss = critic_loss(critic, dream, returns, s.smooth_l1)
     metrics[f"{name}_critic/loss"] = loss
     agent.step(f"{name}_critic", loss, metrics)
-
     if explores:
         with agent.autocast():
             loss = mdn_loss(agent.mdn, dream.state, dream.continues, s.gamma_q).mean()
@@ -246,16 +244,14 @@ def update_actor(
 def measure_gradients(
     agent: "Agent", actor: nn.Module, terms: dict[str, Tensor], beta: float, metrics: dict
 ) -> None:
-    """The gradients of both terms of Eq. (7) apart, and from them, with `beta_share`, the factor
-    that gives ∇Ĥ the norm of ∇R: the β of §5 is for one size of state and one robot's rewards."""
+    """The norms of the gradients of both terms of Eq. (7) apart, and their averages: `beta_share`
+    needs them, since the β of §5 is for one size of state and one robot's rewards."""
     norms = {}
     for name, term in terms.items():
         gradients = torch.autograd.grad(term, list(actor.parameters()), retain_graph=True)
         norms[name] = nn.utils.get_total_norm(gradients)
-    if agent.s.beta_share:
-        ratio = norms["return"] / norms["entropy"].clamp(min=1e-12)
-        new = agent.entropy_scale == 0  # not measured yet
-        agent.entropy_scale.lerp_(ratio, torch.where(new, 1.0, 0.1))
+    average, now = agent.gradient_norms, torch.stack([norms["return"], norms["entropy"]])
+    average.lerp_(now, 0.1 if average.any() else 1.0)
     metrics["stochastic_actor/return_grad_norm"] = norms["return"]
     metrics["stochastic_actor/entropy_grad_norm"] = beta * agent.entropy_scale * norms["entropy"]
 
@@ -276,9 +272,8 @@ def train(run: "Run", stop: Callable[[], bool]) -> None:
         if run.updates < updates_due(run.step, s):
             rows = replay.sample(s.batch_size, s.length, run.rng)
             batch, beta = to_tensors(rows, agent.device), beta_at(run.step, s)
-            look = run.updates % 50 == 0 or "beta" not in run.averages  # once a row of metrics.csv
             began = time.monotonic()
-            metrics = update(agent, batch, beta, s, look)
+            metrics = update(agent, batch, beta, s, look=run.updates % 50 == 0)
             metrics |= {"beta": beta, "update_seconds": time.monotonic() - began}
             run.note_update(metrics)
         elif run.evaluation_due():
@@ -324,12 +319,18 @@ def beta_at(step: int, s: Settings) -> float:
 
 
 def evaluate(agent: "Agent", env, s: Settings, show=lambda text: None) -> list[Episode]:
-    """Episodes of the evaluated actor's mode, each with a seed of its own, always the same ones."""
+    """What episodes of the evaluated actor's mode earned and how long they were; each has a seed of
+    its own, always the same ones. One in which the environment fails is left out."""
     episodes = []
     for k in range(s.eval_episodes):
         show(f"evaluating, episode {k + 1} of {s.eval_episodes}")
         seed = 2**31 - 1 - k  # some environments take none that is larger
-        episodes.append(play(agent, env, agent.evaluated.mode, seed, s.eval_max_steps))
+        try:
+            episode = play(agent, env, agent.evaluated.mode, seed, s.eval_max_steps)
+        except EnvironmentFault as error:  # what only measures never stops a run
+            say(f"An evaluation's episode is left out: {error}")
+            continue
+        episodes.append(episode._replace(images=None, actions=None, rewards=None, states=None))
     return episodes
 
 
@@ -361,8 +362,7 @@ class Agent(nn.Module):
             free_nats=s.free_nats,
         )  # fmt: skip
         size = self.model.size
-        explorer = actors.StochasticActor(size, actions, s.units, min_std=s.actor_min_std)
-        self.actors = nn.ModuleDict({"stochastic": explorer})
+        self.actors = nn.ModuleDict({"stochastic": actors.StochasticActor(size, actions, s.units)})
         if s.deterministic_actor:
             self.actors["deterministic"] = actors.DeterministicActor(size, actions, s.units)
         self.critics = nn.ModuleDict()
@@ -382,7 +382,7 @@ class Agent(nn.Module):
             self.target_mdn.load_state_dict(self.mdn.state_dict())
             self.target_mdn.requires_grad_(False)
             learners["mdn"] = self.mdn, s.mdn_lr
-            self.register_buffer("entropy_scale", torch.tensor(0.0 if s.beta_share else 1.0))
+            self.register_buffer("gradient_norms", torch.zeros(2))  # of ∇R and ∇Ĥ, averaged
         self.to(device)
         self.optimisers = {
             name: torch.optim.Adam(network.parameters(), lr, fused=True)
@@ -398,6 +398,12 @@ class Agent(nn.Module):
         """The actor that plays an episode of training: the explorer, or both in turn."""
         turn = episode % len(self.actors) if self.s.collect == "both" else 0
         return list(self.actors.values())[turn]
+
+    @property
+    def entropy_scale(self) -> Tensor | float:
+        """The factor on Ĥ beside β: 1 (§4.1), or what gives ∇Ĥ the norm of ∇R (`beta_share`)."""
+        of_return, of_entropy = self.gradient_norms
+        return of_return / of_entropy.clamp(min=1e-9) if self.s.beta_share else 1.0
 
     @property
     def precision(self) -> str:
@@ -538,6 +544,8 @@ class Run:
     def report(self, episodes: list[Episode]) -> None:
         """A row of metrics.csv and TensorBoard, a line, and best.pt if none was better."""
         self.evaluated_at = self.step
+        if not episodes:
+            return
         returns, lengths = np.array([(e.total, e.length) for e in episodes]).T
         row = {
             "env_steps": self.step,
@@ -596,6 +604,7 @@ class Run:
         content = {
             "agent": self.agent.state_dict(),
             "optimisers": {name: o.state_dict() for name, o in self.agent.optimisers.items()},
+            "settings": self.s.to_json(),
             "kept": {name: getattr(self, name) for name in self.KEPT},
             "checksums": torch.from_numpy(self.replay.flush()),
             "torch_random": torch.get_rng_state(),
@@ -608,10 +617,15 @@ class Run:
         """Go back to the newest whole checkpoint.
 
         Raises:
-            ValueError: in one sentence, if there is none, or the replay is not its own; nothing in
-                the folder is then changed.
+            ValueError: in one sentence, if there is none, or the replay is not its own.
         """
         path, saved = read_checkpoint(self.folder)
+        made, now = json.loads(saved["settings"]), dataclasses.asdict(self.s)
+        if edited := [k for k in now if k not in CHANGEABLE and now[k] != made.get(k)]:
+            raise ValueError(
+                f"{self.folder} was made with other settings than its settings.json says: "
+                f"{', '.join(f'{k} {made.get(k)}' for k in edited)}; put them back."
+            )
         machine = self.machine
         for name in self.KEPT:
             setattr(self, name, saved["kept"][name])
@@ -628,11 +642,13 @@ class Run:
             self.machine = machine
         if path.name != CHECKPOINTS[0]:  # a damaged one must not take the place of this
             (self.folder / CHECKPOINTS[0]).unlink(missing_ok=True)
-        with open(self.folder / "metrics.csv", "ab") as file:
-            if file.tell() < self.metrics_bytes:
+        with open(self.folder / "metrics.csv", "a+b") as file:
+            file.seek(0)
+            whole = file.read(self.metrics_bytes)  # without rows that are younger
+            if len(whole) < self.metrics_bytes:
                 say(f"{file.name} has lost rows since the checkpoint: it goes on without them.")
-            self.metrics_bytes = min(file.tell(), self.metrics_bytes)
-            file.truncate(self.metrics_bytes)  # rows that are younger
+            self.metrics_bytes = whole.rfind(b"\n") + 1
+            file.truncate(self.metrics_bytes)
         self.retrace()
         torch.set_rng_state(saved["torch_random"])
         if self.agent.device.type == "cuda" and saved["cuda_random"]:
@@ -642,12 +658,14 @@ class Run:
         """Take the actions of the episode under way again: its environment is then where it was."""
         if self.over:
             return
-        actions, state, length, image = self.actions, self.state, self.length, None
+        actions, state, length = self.actions, self.state, self.length
         self.episode -= 1
-        with contextlib.suppress(EnvironmentFault):
+        try:
             image = self.begin_episode()
             for action in actions:
                 image = self.env.step(action.numpy())[0]
+        except EnvironmentFault:
+            image = None
         self.actions, self.state, self.length = actions, state, length
         self.over = not np.array_equal(image, self.replay.last["image"])
         if self.over:
@@ -681,9 +699,11 @@ def read_checkpoint(folder: Path) -> tuple[Path, dict]:
     """
     for path in (folder / name for name in CHECKPOINTS):
         if path.exists():
-            with contextlib.suppress(zipfile.BadZipFile), zipfile.ZipFile(path) as file:
+            with contextlib.suppress(Exception), zipfile.ZipFile(path) as file:  # damage has many
                 if file.testzip() is None:  # each part has the checksum that was written with it
-                    return path, torch.load(path, map_location="cpu", weights_only=True)
+                    saved = torch.load(path, map_location="cpu", weights_only=True)
+                    if "settings" in saved and saved["kept"].keys() == set(Run.KEPT):
+                        return path, saved
             say(f"{path} is damaged: looking for the one before it.")
     raise ValueError(f"{folder} holds no whole checkpoint: start a new run in another folder.")
 
@@ -823,14 +843,19 @@ def new_run(command: Command) -> Run:
     if command.run_dir and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"{folder} is there already: name another --run-dir, or --resume it.")
     run = Run(s, folder, command.device, command.precision)
-    while not command.run_dir and run.folder.exists():  # begun in the same second
-        run.folder = run.folder.with_name(run.folder.name + "+")
-    run.folder.mkdir(parents=True, exist_ok=bool(command.run_dir))
+    while True:
+        try:
+            run.folder.mkdir(parents=True, exist_ok=bool(command.run_dir))
+            break
+        except FileExistsError:  # begun in the same second
+            if command.run_dir:
+                raise
+            run.folder = run.folder.with_name(run.folder.name + "+")
     try:
         run.open()
         run.save()
         run.sign()
-    except OSError:
+    except BaseException:
         shutil.rmtree(run.folder, ignore_errors=True)
         raise
     return run
@@ -866,7 +891,12 @@ CHANGEABLE = (
 
 def main(arguments: list[str]) -> int:
     """Runs a command line. Returns the exit code: 0 done, 1 stopped by a fault, 2 bad input."""
+    if "--evaluate" in arguments:  # what only looks at a run stands in results/
+        player = str(Path(__file__).with_name("results") / "play.py")
+        rest = [argument for argument in arguments if argument != "--evaluate"]
+        return subprocess.call([sys.executable, player, *rest])
     keep_freed_memory()
+    threading.excepthook = leave_out_os_errors
     try:
         command = parse(arguments)
         run = new_run(command) if command.resume is None else resumed_run(command)
@@ -891,15 +921,13 @@ def train_run(run: Run) -> int:
     print(run.describe(), flush=True)
     resume = "Go on with: " + shlex.join([sys.executable, __file__, "--resume", str(run.folder)])
     every = 0.5 if sys.stderr.isatty() else 30  # seconds between two lines of a log file
-    threading.excepthook = leave_out_os_errors
     try:
         with (
             tqdm(total=run.s.steps, initial=run.step, unit="step", mininterval=every) as run.bar,
             SummaryWriter(run.folder, purge_step=run.step + 1) as run.writer,
         ):
             for name in ("SIGINT", "SIGTERM", "SIGHUP"):  # Windows has no SIGHUP
-                if hasattr(signal, name):
-                    signal.signal(getattr(signal, name), stop)
+                signal.signal(getattr(signal, name, signal.SIGINT), stop)
             train(run, stopped.is_set)
     except FloatingPointError as error:
         say(f"{error} The last checkpoint is from before: go on from it with a lower --model-lr, "

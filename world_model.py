@@ -333,8 +333,7 @@ class WorldModel(nn.Module):
         action, which h_{t+1} holds.
 
         Args:
-            batch: image (B, T, 64, 64, 3) uint8; action (B, T, A), reward, terminated, is_first (B,
-                T).
+            batch: image (B, T, 64, 64, 3) uint8; action (B, T, A); the flags and reward (B, T).
 
         Returns:
             the terms, and the posterior states (B, T, D).
@@ -345,15 +344,12 @@ class WorldModel(nn.Module):
         image = self.decoder.nll(
             self.decoded(observed.state).flatten(0, 1), batch["image"].flatten(0, 1)
         )
-        predicted = self.reward(observed.state).squeeze(-1)
-        reward_loss = (
-            F.smooth_l1_loss if self.smooth_l1 else lambda *a, **k: 0.5 * F.mse_loss(*a, **k)
-        )
+        error = self.predict_reward(observed.state) - batch["reward"]
+        squared = 0.5 * error.square()
+        reward = F.smooth_l1_loss(error, 0 * error, reduction="none") if self.smooth_l1 else squared
         terms = {
             "image": masked_mean(image.view_as(seen), seen),
-            "reward": masked_mean(
-                reward_loss(predicted, batch["reward"], reduction="none"), arrived
-            ),
+            "reward": masked_mean(reward, arrived),
         }
         if self.termination is not None:
             logit = self.termination(observed.state).squeeze(-1)

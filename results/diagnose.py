@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from actors import Episode, imagined_returns, play
 from env import EnvironmentFault
 from results.play import add_loading, load, open_loop
-from train import Agent
+from train import Agent, Patient
 
 OPEN_LOOP = 15  # steps that the model is followed without images
 
@@ -261,7 +261,7 @@ def read_metrics(folder: Path) -> list[dict[str, str]]:
     path = folder / "metrics.csv"
     lines = path.read_text(errors="replace").splitlines() if path.is_file() else []
     rows = csv.DictReader(lines)
-    return [row for row in rows if None not in row.values() and None not in row]
+    return [row for row in rows if None not in [*row, *row.values()] and "env_steps" in row]
 
 
 def diagnose(command: argparse.Namespace) -> Path:
@@ -315,4 +315,5 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
+    sys.stdout, sys.stderr = Patient(sys.stdout), Patient(sys.stderr)
     sys.exit(main(sys.argv[1:]))

@@ -19,6 +19,7 @@ from actors import Episode, play
 from env import EnvironmentFault, make_env
 from train import (
     Agent,
+    Patient,
     interval95,
     load_networks,
     make_agent,
@@ -47,8 +48,8 @@ def load(folder: Path, checkpoint: str, device: str, precision: str):
         raise ValueError(f"{folder} was not evaluated yet: it has no best.pt.")
     try:
         load_networks(agent, torch.load(path, map_location="cpu", weights_only=True))
-    except RuntimeError as error:
-        raise ValueError(f"{path} is damaged: {str(error).splitlines()[0]}") from None
+    except Exception as error:  # damage has many
+        raise ValueError(f"{path} is damaged: {type(error).__name__}.") from None
     return s, env, agent, "best"
 
 
@@ -166,4 +167,5 @@ def add_loading(parser: argparse.ArgumentParser) -> None:
 
 
 if __name__ == "__main__":
+    sys.stdout, sys.stderr = Patient(sys.stdout), Patient(sys.stderr)
     sys.exit(main(sys.argv[1:]))

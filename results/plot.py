@@ -22,7 +22,7 @@ import numpy as np
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
-from train import ARMS, default_settings, interval95
+from train import ARMS, Patient, default_settings, interval95
 
 # what may differ between runs of one line: who and where, not what is learnt
 NOT_LEARNT = {
@@ -59,7 +59,7 @@ def read_run(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
         ValueError: if it is no run's.
     """
     settings = json.loads(path.read_text())
-    label(settings), settings["env"], settings["seed"], settings["action_repeat"]
+    label(settings), settings["seed"], int(settings["action_repeat"]), settings["env"].lower()
     metrics = path.with_name("metrics.csv")
     lines = metrics.read_text().splitlines() if metrics.exists() else []
     rows = [row for row in csv.DictReader(lines) if None not in row.values() and None not in row]
@@ -69,13 +69,16 @@ def read_run(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
     return settings, columns
 
 
+def differ(run: dict, other: dict, action_repeat: int) -> bool:
+    """Whether two runs were evaluated at different steps."""
+    pairs = zip(run["env_steps"], other["env_steps"], strict=False)
+    return any(abs(a - b) >= action_repeat for a, b in pairs)
+
+
 def read_runs(folder: Path) -> dict[str, dict[str, dict[str, dict[str, np.ndarray]]]]:
     """{env: {label: {name: {column: values}}}} of each run in a folder, named by its seed; a second
     one of a seed also by its folder. Runs without an evaluation are left out, and what is no
     run is, with a word.
-
-    Raises:
-        ValueError: if two seeds of one experiment were evaluated at different steps.
     """
     runs = defaultdict(lambda: defaultdict(dict))
     for path in sorted(folder.glob("*/settings.json")):
@@ -87,10 +90,9 @@ def read_runs(folder: Path) -> dict[str, dict[str, dict[str, dict[str, np.ndarra
         if not columns:
             continue
         seeds = runs[settings["env"]][label(settings)]
-        for other in seeds.values():
-            pairs = zip(columns["env_steps"], other["env_steps"], strict=False)
-            if any(abs(a - b) >= settings["action_repeat"] for a, b in pairs):
-                raise ValueError(f"{path.parent} was evaluated at other steps than another seed.")
+        if any(differ(columns, other, settings["action_repeat"]) for other in seeds.values()):
+            print(f"{path.parent} is left out: other steps than another seed's", file=sys.stderr)
+            continue
         name = str(settings["seed"])
         seeds[f"{name}, {path.parent.name}" if name in seeds else name] = columns
     return runs
@@ -131,8 +133,10 @@ def draw(path: Path, runs, reference) -> None:
                 draw_curve(axes, seeds, column, name, colors[name])
             every_value = np.concatenate([r[column] for seeds in arms.values()
                                           for r in seeds.values()])  # fmt: skip
-            margin = 0.1 * np.ptp(every_value) + 1  # an interval over two seeds may leave the panel
-            axes.set_ylim(every_value.min() - margin, every_value.max() + margin)
+            every_value = every_value[np.isfinite(every_value)]
+            if every_value.size:  # an interval over two seeds may leave the panel
+                margin = 0.1 * np.ptp(every_value) + 1
+                axes.set_ylim(every_value.min() - margin, every_value.max() + margin)
             axes.set_ylabel(label)
             if column == "eval_return":
                 for policy, style in POLICIES.items():
@@ -187,7 +191,7 @@ def main(arguments: list[str]) -> int:
         if not runs:
             raise ValueError(f"{folder} holds no evaluated run in a folder: nothing to draw.")
         draw(folder / "curves.png", runs, reference)
-        (folder / "table.md").write_text(table(runs, reference))
+        (folder / "table.md").write_text(table(runs, reference), encoding="utf-8")
     except (ValueError, OSError) as error:
         print(error, file=sys.stderr)
         return 2
@@ -196,4 +200,5 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
+    sys.stdout, sys.stderr = Patient(sys.stdout), Patient(sys.stderr)
     sys.exit(main(sys.argv[1:]))

@@ -60,14 +60,6 @@ def test_policy_before_the_tanh_has_a_bounded_mean_and_a_positive_deviation():
     np.testing.assert_allclose(got.stddev[:2].detach(), [5.0001, 1e-4], rtol=1e-5)
 
 
-def test_the_floor_under_sigma_keeps_an_explorer_stochastic():
-    std = [
-        always(StochasticActor(6, 1, 8, min_std=floor), 0.0, -40.0).distribution(torch.zeros(1, 6))
-        for floor in (1e-4, 0.3)
-    ]
-    assert [round(d.stddev.item(), 4) for d in std] == [0.0001, 0.3]
-
-
 @pytest.mark.parametrize("actor", [StochasticActor(6, 2, 8), DeterministicActor(6, 2, 8)])
 def test_raw_is_what_the_bounds_act_on(actor):
     state = torch.randn(5, 6)

@@ -18,6 +18,7 @@ from train import (
     beta_at,
     default_settings,
     interval95,
+    measure_gradients,
     parse,
     reward_r2,
     to_tensors,
@@ -55,7 +56,6 @@ CADENCE = {"steps", "prefill", "train_every", "updates", "eval_every"}
 LEARNING = {
     "floor_brightness": (0.4, 1.0), "reward_weight": (20.0, 1.0), "squared_reward": (True, False),
     "action_penalty": (0.01, 0.0), "beta_share": (True, False), "starts": (0.5, 1.0),
-    "actor_min_std": (0.3, 1e-4),
 }  # fmt: skip
 ACTIONS = 2
 
@@ -501,16 +501,27 @@ def test_beta_share_gives_the_entropys_gradient_that_share_of_the_returns():
     s = tiny("maxent", beta_share=True)
     agent = make_agent(s)
     for beta in (0.2, 0.05):
-        agent.entropy_scale.zero_()
+        agent.gradient_norms.zero_()
         looked = update(agent, make_batch(s), beta, s, look=True)
         share = looked["stochastic_actor/entropy_grad_norm"]
         assert share == pytest.approx(beta * looked["stochastic_actor/return_grad_norm"], rel=1e-5)
-    before = agent.entropy_scale.item()
+    before = float(agent.entropy_scale)
     update(agent, make_batch(s), 0.2, s)
-    assert agent.entropy_scale.item() == before  # measured only when looked at
+    assert float(agent.entropy_scale) == before  # measured only when looked at
     literal = make_agent(tiny("maxent"))
     update(literal, make_batch(s), 0.2, literal.s, look=True)
-    assert literal.entropy_scale.item() == 1
+    assert literal.entropy_scale == 1
+
+
+def test_one_vanishing_gradient_does_not_make_an_update_all_entropy():
+    """The norms are averaged apart: the mean of their ratios would jump by 1e5."""
+    agent = make_agent(tiny("maxent", beta_share=True))
+    actor = agent.actors["stochastic"]
+    total = sum(p.sum() for p in actor.parameters())
+    for k in range(10):
+        terms = {"return": 3.0 * total, "entropy": (1e-6 if k == 5 else 1.0) * total}
+        measure_gradients(agent, actor, terms, 0.1, {})
+    assert 3 <= float(agent.entropy_scale) < 3.5
 
 
 def test_rewards_are_squared_where_asked_and_the_critic_keeps_smooth_l1():

@@ -193,6 +193,30 @@ def test_what_an_environment_does_later_is_one_sentence_that_names_it(
     assert len(metrics(folder)) == 2
 
 
+class FailsWhenEvaluated(Base):
+    """The second of a run's two environments is that of its evaluations."""
+
+    made = 0
+
+    def __init__(self, render_mode=None):
+        super().__init__(render_mode)
+        type(self).made += 1
+        self.number = self.made
+
+    def step(self, action):
+        if self.number == 2 and self.steps > 5:
+            raise OSError("no")
+        return super().step(action)
+
+
+def test_an_environment_that_fails_in_an_evaluation_stops_nothing(register, tmp_path, capfd):
+    folder = tmp_path / "run"
+    FailsWhenEvaluated.made = 0
+    assert train.main(["--env", register(FailsWhenEvaluated), "--run-dir", str(folder), *FAST]) == 0
+    assert "left out: Stub-v0 raised OSError" in capfd.readouterr().err
+    assert (folder / "weights.pt").exists()
+
+
 # ---- facts of the machine ------------------------------------------------------------------------
 
 
@@ -296,6 +320,15 @@ def flip(path: Path, at: float) -> None:
     path.write_bytes(content)
 
 
+@pytest.mark.parametrize("at", np.linspace(0, 0.999, 12))
+def test_a_checkpoint_damaged_anywhere_is_said_and_the_one_before_it_taken(at, stub_run, capsys):
+    flip(stub_run / "checkpoint.pt", at)
+    path, saved = train.read_checkpoint(stub_run)
+    said = capsys.readouterr().err
+    assert (path.name == "checkpoint.previous.pt") == ("is damaged" in said)
+    assert saved["kept"].keys() == set(train.Run.KEPT)
+
+
 @pytest.mark.parametrize("damage", ["flipped", "shorter", "gone"])
 def test_a_replay_that_is_not_its_checkpoints_is_refused(damage, stub_run, capsys):
     path = stub_run / "replay.bin"
@@ -322,10 +355,18 @@ def test_settings_that_cannot_be_are_refused_by_name(change, stub_run, capsys):
     refused(["--resume", stub_run], capsys, name)
 
 
+def test_an_edited_setting_that_made_the_run_what_it_is_is_not_taken(stub_run, capsys):
+    path = stub_run / "settings.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"gamma": 0.5}))
+    before = contents(stub_run)
+    refused(["--resume", stub_run, "--steps", "180"], capsys, "gamma 0.99")
+    assert contents(stub_run) == before
+
+
 @pytest.mark.parametrize("text", ["", "{", "[]", "7", "null", '"a"', "\0\0", "\ufeff{}"])
 def test_settings_that_are_none_are_refused(text, stub_run, capsys):
     (stub_run / "settings.json").write_text(text)
-    refused(["--resume", stub_run], capsys, "run")
+    refused(["--resume", stub_run], capsys, "settings")
 
 
 def test_a_run_without_checkpoints_is_refused_and_left_as_it_is(stub_run, capsys):

@@ -160,6 +160,14 @@ def test_any_run_can_be_played_and_filmed(trained, which, capsys):
     assert Image.open(trained / f"strip-{name}.png").size == (640, 6 * 64)
 
 
+def test_train_py_evaluates_by_it(trained, tmp_path, capfd):
+    assert main(["--evaluate", str(trained), "--episodes", "1", "--checkpoint", "best"]) == 0
+    assert "networks best" in capfd.readouterr().out
+    for arguments in (["--evaluate", str(tmp_path)], ["--evaluate", "x", "--episodes", "0"]):
+        assert main(arguments) == 2
+        assert len(capfd.readouterr().err.strip().splitlines()) == 1
+
+
 def test_one_episode_has_no_interval(trained, capsys):
     assert play.main([str(trained), "--episodes", "1", "--actor", "stochastic"]) == 0
     said = capsys.readouterr().out
@@ -222,13 +230,21 @@ def test_two_runs_of_one_seed_are_two_lines_and_both_count(tmp_path):
     assert plot.main([str(tmp_path)]) == 0
 
 
-def test_seeds_that_cannot_be_averaged_are_refused(tmp_path, capsys):
+def test_a_seed_that_cannot_be_averaged_is_left_out_with_a_word(tmp_path, capsys):
     write_run(tmp_path / "a", "1 2")
     write_run(tmp_path / "b", "1", seed=1)
     path = tmp_path / "b" / "metrics.csv"
     path.write_text(path.read_text().replace("\n5000,", "\n7000,"))
-    assert plot.main([str(tmp_path)]) == 2
-    assert "steps" in capsys.readouterr().err
+    assert plot.main([str(tmp_path)]) == 0
+    said = capsys.readouterr()
+    assert "steps" in said.err and "maxent | 1 |" not in said.out
+
+
+def test_coverage_that_is_unknown_leaves_the_returns_drawn(tmp_path):
+    write_run(tmp_path / "a", "1 2")
+    path = tmp_path / "a" / "metrics.csv"
+    path.write_text(path.read_text().replace(",2.5", ",nan"))
+    assert plot.main([str(tmp_path)]) == 0
 
 
 @pytest.mark.parametrize("file, content", [

@@ -66,7 +66,7 @@ def test_each_arm_trains_on_pixels_and_moves_every_parameter(arm, tmp_path):
     assert all(0 <= float(row["stochastic_actor/saturated"]) <= 1 for row in rows)
     assert all(float(row["beta"]) == pytest.approx(0.1, abs=0.1) for row in rows)  # columns stay
     if settings.entropy:
-        assert all(float(row["stochastic_actor/return_grad_norm"]) > 0 for row in rows)
+        assert float(rows[0]["stochastic_actor/return_grad_norm"]) > 0  # every fiftieth update's
     torch.manual_seed(settings.seed)
     fresh = Agent(settings, actions=3, device=torch.device("cpu"), bfloat16=False).state_dict()
     saved = torch.load(folder / "weights.pt", weights_only=True)
