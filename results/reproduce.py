@@ -1,176 +1,150 @@
-"""The paper's figure: arms × environments × seeds, a process each, some at once.
+"""The paper's figure by one command: arms × environments × seeds, some processes at once.
 
-    python results/reproduce.py --workers 2
+    python results/reproduce.py [--smoke] [-- OPTIONS OF TRAIN.PY]
 
-Runs lie in OUT/ENV-ARM-seedS. Unfinished ones are taken up, finished ones skipped, and a failure of
-one stops no other; so the same command goes on after Ctrl-C, SIGTERM or a kill. It ends with the
-figure and the table (results/plot.py). What stands after -- goes to train.py as it is.
+A run is a train.py of one thread in OUT/ENV-ARM-seedS; what it says is in the .log beside it, what
+made it in its made_with.json. The same command again skips finished runs and takes up the others.
 """
 
 import argparse
-import csv
-import json
+import contextlib
 import os
+import re
 import shlex
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from filelock import FileLock, Timeout
 from tqdm import tqdm
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import train
 from results import plot
-from train import ARMS, Patient
+from results.made_with import record
+from results.reference import ENVIRONMENTS
 
-ROBOTS = ("Hopper", "Walker2D", "HalfCheetah", "Ant")
-SMOKE = shlex.split(
-    "--deter 16 --stoch 8 --hidden 16 --units 16 --depth 2 --mdn-units 16 --horizon 5 "
-    "--batch-size 3 --length 8 --prefill 60 --eval-every 60 --eval-episodes 1 --eval-max-steps 40"
-)
-SMOKE_STEPS = 120
+TINY = "--deter 16 --stoch 8 --units 16 --depth 2 --mdn-units 16 --horizon 5 --prefill 60 "
+TINY += "--batch-size 3 --length 8 --eval-every 100 --eval-episodes 2 --eval-max-steps 50"
+SMOKE = dict(seeds=[0], steps=200, out=Path("runs/smoke"), options=TINY.split())
 
 
 def parse(arguments: list[str]) -> argparse.Namespace:
-    """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="python results/reproduce.py", description="Makes the paper's figure.",
-        epilog="What stands after -- goes to train.py as it is.",
-    )  # fmt: skip
-    add, cores = parser.add_argument, len(getattr(os, "sched_getaffinity", lambda _: [0])(0))
-    add("--arms", nargs="+", choices=ARMS, default=list(ARMS), help="curves (all)")
-    envs = [f"{robot}BulletEnv-v0" for robot in ROBOTS]
-    add("--envs", nargs="+", default=envs, help="Gymnasium ids (the paper's four)")
-    add("--seeds", nargs="+", type=int, default=[0, 1], help="seeds of each curve (0 1)")
-    add("--steps", type=int, default=100_000, help="environment steps of a run (%(default)s)")
-    add("--workers", type=int, default=cores, help="runs at once, a thread each (%(default)s)")
-    add("--out", type=Path, default=Path("runs/figure"), help="folder of the runs (%(default)s)")
-    add("--index", type=int, help="make this run alone, for a scheduler's job array")
-    add("--list", action="store_true", help="print the runs and their indices, and end")
-    add("--smoke", action="store_true", help="all of it with tiny runs, in some two minutes")
-    cut = arguments.index("--") if "--" in arguments else len(arguments)
+    """The command line; bad input ends the process with one sentence and exit code 2."""
+    parser = argparse.ArgumentParser(prog="reproduce.py", epilog="After --: options of train.py.")
+    parser.error = lambda text: parser.exit(2, f"{text}\n")
+    add, allowed = parser.add_argument, getattr(os, "sched_getaffinity", None)  # not on macOS
+    cores = len(allowed(0)) if allowed else os.cpu_count() or 1
+    add("--arms", nargs="+", choices=train.ARMS, default=list(train.ARMS), help="all four arms")
+    add("--envs", nargs="+", default=[f"{e}BulletEnv-v0" for e in ENVIRONMENTS], help="four robots")
+    add("--seeds", nargs="+", type=int, default=[0, 1], help="%(default)s")
+    add("--steps", type=int, default=100_000, help="environment steps of each run: %(default)s")
+    add("--out", type=Path, default=Path("runs/figure"), help="folder of the runs: %(default)s")
+    add("--workers", type=int, default=cores, help="runs at once, a thread each: %(default)s")
+    add("--index", type=int, help="make this run alone, in the foreground: for a job array")
+    add("--list", action="store_true", help="print each run's index and name, and end")
+    add("--smoke", action="store_true", help="all of it with tiny networks, in two minutes")
+    parser.set_defaults(**(SMOKE if "--smoke" in arguments else {"options": []}))
+    cut = [*arguments, "--"].index("--")
     command = parser.parse_args(arguments[:cut])
-    command.options = arguments[cut + 1 :]
-    if command.smoke:
-        command.steps, command.seeds = SMOKE_STEPS, command.seeds[:1]
-        command.options = [*SMOKE, *command.options]
-    if command.workers < 1:
-        parser.error("--workers must be 1 or more")
+    command.runs = runs(command, command.options + arguments[cut + 1 :])
+    if command.index is not None:
+        command.runs = dict([*command.runs.items()][command.index :][:1])
+    if not command.runs or min(command.workers - 1, command.index or 0, *command.seeds) < 0:
+        parser.error("--workers: 1 or more; --seeds: 0 or more; --index: one that --list shows.")
+    try:  # what the first run cannot have, none can
+        command.list or command.out.mkdir(parents=True, exist_ok=True)
+        train.check(train.parse(next(iter(command.runs.values()))).settings.to_json())
+    except (ValueError, OSError) as error:
+        parser.error(error)
     return command
 
 
-def names(command: argparse.Namespace) -> list[tuple[str, list[str]]]:
-    """Each run's name and options; all arms of a seed before the next, lest a figure that is cut
-    short be unfair to one."""
-    return [
-        (f"{env}-{arm}-seed{seed}".replace("/", "-").replace(":", "-"),
-         ["--env", env, "--arm", arm, "--seed", str(seed)])
+def runs(command: argparse.Namespace, options: list[str]) -> dict[Path, list[str]]:
+    """Each run's folder and options; seed by seed, so that a figure cut short is fair to arms."""
+    return {
+        command.out / re.sub(r"[^\w.-]", "-", f"{env}-{arm}-seed{seed}"):
+        [*options, f"--steps={command.steps}", f"--env={env}", f"--arm={arm}", f"--seed={seed}"]
         for seed in command.seeds for env in command.envs for arm in command.arms
-    ]  # fmt: skip
+    }  # fmt: skip
 
 
-def steps_made(folder: Path) -> int:
-    """Environment steps at the last evaluation of a run; 0 before the first."""
+def steps_made(folder: Path, steps: int) -> int:
+    """Environment steps of a run at its last evaluation; `steps` only if it is finished."""
     path = folder / "metrics.csv"
-    lines = path.read_text().splitlines() if path.exists() else []
-    made = [row.get("env_steps") or "" for row in csv.DictReader(lines)]
-    return int(made[-1]) if made and made[-1].isdigit() else 0
+    last = "".join(path.read_text().splitlines()[-1:] if path.exists() else []).partition(",")[0]
+    made = int(last) if last.isdigit() else 0
+    return min(made, steps if (folder / "weights.pt").exists() else steps - 1)
 
 
-def finished(folder: Path, steps: int) -> bool:
-    """Whether a run has made its steps and been evaluated at their end."""
-    return (folder / "weights.pt").exists() and steps_made(folder) >= steps
-
-
-def start(folder: Path, options: list[str], command: argparse.Namespace) -> subprocess.Popen:
-    """Begin a run, or take it up. Its words go to NAME.log beside its folder."""
-    train = [sys.executable, str(ROOT / "train.py")]
-    if (folder / "settings.json").exists():
-        train += ["--resume", str(folder), "--steps", str(command.steps)]
-    else:
-        if folder.exists():  # killed before it was whole: settings.json is written last
+def start(folder: Path, options: list[str], log) -> subprocess.Popen:
+    """Begin a run or take it up; in its own session, so that Ctrl-C comes through `make` alone."""
+    whole = (folder / "settings.json").exists()  # train.py writes it last, and then trains
+    if folder.is_dir() and not whole and not (folder / "metrics.csv").exists():
+        with contextlib.suppress(Timeout), FileLock(folder / "run.lock", blocking=False):
+            tqdm.write(f"{folder} was ended before it began: deleted, begun anew.", sys.stderr)
             shutil.rmtree(folder)
-        train += ["--run-dir", str(folder), "--steps", str(command.steps), *options]
-        train += command.options
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with open(folder.with_name(folder.name + ".log"), "a") as log:
-        return subprocess.Popen(
-            train, stdout=log, stderr=log, stdin=subprocess.DEVNULL,
-            env=os.environ | {"OMP_NUM_THREADS": "1"}, start_new_session=True,
-        )  # fmt: skip
+    line = [sys.executable, train.__file__, *options, "--resume" if whole else "--run-dir", folder]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(line, stdout=log, stderr=log, env=environment, start_new_session=True)
 
 
-def run_all(command: argparse.Namespace, stopped: list) -> list[str]:
-    """Makes what is missing; returns the names of the runs that failed."""
-    every = [(command.out / name, options) for name, options in names(command)]
-    waiting = [(f, options) for f, options in every if not finished(f, command.steps)]
-    running: dict[Path, subprocess.Popen] = {}
-    failed, total = [], command.steps * len(every)
-    before = sum(min(steps_made(f), command.steps) for f, _ in every)
-    with tqdm(total=total, initial=before, unit="step", desc=f"{len(every)} runs") as bar:
-        while running or (waiting and not stopped):
-            while waiting and len(running) < command.workers and not stopped:
-                folder, options = waiting.pop(0)
-                running[folder] = start(folder, options, command)
-            time.sleep(0.5)
-            for folder, process in list(running.items()):
-                if stopped and process.poll() is None and process not in stopped:
-                    process.send_signal(signal.SIGINT)  # it saves and ends
-                    stopped.append(process)
-                if process.poll() is not None:
-                    del running[folder]
-                    if process.returncode and process.returncode != -signal.SIGINT:
-                        failed.append(folder.name)
-            made = sum(min(steps_made(folder), command.steps) for folder, _ in every)
-            bar.update(made - bar.n)
-            bar.set_postfix_str(", ".join(folder.name for folder in running)[:60])
-    return failed
-
-
-def record(command: argparse.Namespace) -> None:
-    """What the runs were made with, beside them: made_with.json."""
-    commit = subprocess.run(
-        ["git", "-C", str(ROOT), "describe", "--always", "--dirty"], capture_output=True, text=True
-    ).stdout.strip()
-    command.out.mkdir(parents=True, exist_ok=True)
-    made = {"commit": commit or "unknown", "python": sys.version.split()[0], "threads": 1,
-            "options": command.options}  # fmt: skip
-    (command.out / "made_with.json").write_text(json.dumps(made, indent=2) + "\n")
+def make(folder: Path, command: argparse.Namespace, ends: list[int]) -> str:
+    """Make a run, passing on to it the signals that come into `ends`: why it failed, if it did."""
+    if ends or steps_made(folder, command.steps) == command.steps:
+        return ""
+    log, told, recorded = folder.with_name(folder.name + ".log"), 0, False
+    with open(log, "a") if command.index is None else contextlib.nullcontext() as file:
+        before, process = file and file.tell(), start(folder, command.runs[folder], file)
+    while process.poll() is None:
+        time.sleep(0.5)
+        recorded = recorded or record(folder, process.pid)
+        for number in ends[told:]:  # it saves and ends; at once if Ctrl-C comes again
+            process.send_signal(number)
+            told += 1
+    if ends or steps_made(folder, command.steps) == command.steps:
+        return ""
+    said = log.read_bytes()[before:].decode(errors="replace").splitlines() if file else []
+    if re.search("in use by|is there already", str(said)) and (folder / "settings.json").exists():
+        tqdm.write(f"{folder} is another process's, and left to it.", sys.stderr)
+        return ""
+    return ": ".join([f"{folder.name} failed with exit code {process.returncode}", *said[-1:]])
 
 
 def main(arguments: list[str]) -> int:
-    """Runs a command line. Returns the exit code: 0 done, 1 some run failed, 2 bad input."""
-    command, stopped = parse(arguments), []
-    chosen = names(command)
+    """Runs a command line. Returns 0 done, 1 a run failed, 75 stopped (EX_TEMPFAIL: try again)."""
+    command, ends = parse(arguments), []
     if command.list:
-        print(*(f"{k} {name}" for k, (name, _) in enumerate(chosen)), sep="\n")
+        print(*(f"{k} {folder.name}" for k, folder in enumerate(command.runs)), sep="\n")
         return 0
-    if command.index is not None:
-        if not 0 <= command.index < len(chosen):
-            print(f"--index {command.index}: give 0 to {len(chosen) - 1}.", file=sys.stderr)
-            return 2
-        name, options = chosen[command.index]
-        process = start(command.out / name, options, command)
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: process.send_signal(signal.SIGINT))
-        return process.wait()
-    record(command)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, lambda *_: stopped.append(None))
-    failed = run_all(command, stopped)
-    for name in failed:
-        log = (command.out / f"{name}.log").read_text(errors="replace").splitlines()
-        print(f"{name} failed: {log[-1] if log else 'without a word'}", file=sys.stderr)
-    if stopped:
-        again = shlex.join([sys.executable, str(Path(__file__)), *arguments])
-        print(f"Stopped; what was learnt is saved. Go on with: {again}")
-    drawn = plot.main([str(command.out)])
-    return 1 if failed else drawn
+        if signal.getsignal(number) != signal.SIG_IGN:  # as nohup has it
+            signal.signal(number, lambda number, _: ends.append(number))
+    made = {folder: steps_made(folder, command.steps) for folder in command.runs}
+    with ThreadPoolExecutor(command.workers) as pool, tqdm(
+        total=command.steps * len(made), initial=sum(made.values()), unit=" steps", unit_scale=True,
+        smoothing=0, miniters=0, mininterval=10, disable=command.index is not None,
+    ) as bar:  # fmt: skip
+        work = {folder: pool.submit(make, folder, command, ends) for folder in made}
+        while not all(w.done() for w in work.values()):
+            time.sleep(0.5)
+            made = {folder: steps_made(folder, command.steps) for folder in made}
+            bar.total = sum(n if work[f].done() else command.steps for f, n in made.items())
+            bar.update(sum(made.values()) - bar.n)
+    drawn = plot.main([str(command.out)]) if command.index is None else 0
+    failed = [why for w in work.values() if (why := w.exception() or w.result())]
+    for why in failed:
+        train.say(why)
+    if ends:
+        train.say("Stopped. Go on with: " + shlex.join([sys.executable, __file__, *arguments]))
+        return 75
+    return 1 if failed or drawn else 0
 
 
 if __name__ == "__main__":
-    sys.stdout, sys.stderr = Patient(sys.stdout), Patient(sys.stderr)
+    sys.stdout, sys.stderr = train.Patient(sys.stdout), train.Patient(sys.stderr)
     sys.exit(main(sys.argv[1:]))
