@@ -778,7 +778,7 @@ def parse(arguments: list[str]) -> Command:
 
     first = parsed(Settings(), [a for a in arguments if a not in ("-h", "--help")])
     if first.resume is not None:
-        return parsed(read_settings(Path(first.resume)), arguments)
+        return parsed(read_settings(folder_named(first.resume)), arguments)
     return parsed(default_settings(first.settings.arm, first.settings.preset), arguments)
 
 
@@ -831,6 +831,18 @@ def read_settings(folder: Path) -> Settings:
     return check(text, f"{path}: ")
 
 
+def folder_named(text: str) -> Path:
+    """The folder that a user names, wherever the environment goes.
+
+    Raises:
+        ValueError: in one sentence, if its name is not UTF-8, as TensorBoard's files want it.
+    """
+    path = os.path.abspath(os.path.expanduser(text))
+    if path != path.encode(errors="ignore").decode():
+        raise ValueError(f"{path!a} is not UTF-8: name another folder.")
+    return Path(path)
+
+
 def new_run(command: Command) -> Run:
     """A new run in a folder of its own, made once all else is known to work.
 
@@ -839,9 +851,10 @@ def new_run(command: Command) -> Run:
     """
     s = check(command.settings.to_json())
     name = f"{s.env}-{s.arm}-{s.preset}-seed{s.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
-    folder = Path(command.run_dir or "runs/" + re.sub(r"[^\w.-]", "-", name))
+    folder = folder_named(command.run_dir or "runs/" + re.sub(r"[^\w.-]", "-", name))
+    taken = f"{folder} is there already: name another --run-dir, or --resume it."
     if command.run_dir and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ValueError(f"{folder} is there already: name another --run-dir, or --resume it.")
+        raise ValueError(taken)
     run = Run(s, folder, command.device, command.precision)
     while True:
         try:
@@ -853,8 +866,12 @@ def new_run(command: Command) -> Run:
             run.folder = run.folder.with_name(run.folder.name + "+")
     try:
         run.open()
+        if (run.folder / "settings.json").exists():  # of a process that was faster, and is done
+            raise ValueError(taken)
         run.save()
         run.sign()
+    except ValueError:  # the folder is another's
+        raise
     except BaseException:
         shutil.rmtree(run.folder, ignore_errors=True)
         raise
@@ -867,7 +884,7 @@ def resumed_run(command: Command) -> Run:
     Raises:
         ValueError: in one sentence, why it cannot go on, or not with these settings.
     """
-    folder = Path(command.resume)
+    folder = folder_named(command.resume)
     before, after = (dataclasses.asdict(x) for x in (read_settings(folder), command.settings))
     changed = {name: value for name, value in after.items() if value != before[name]}
     if command.run_dir or changed.keys() - CHANGEABLE:

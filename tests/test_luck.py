@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 from typing import ClassVar
 
+import filelock
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -104,7 +105,41 @@ def test_a_run_that_goes_on_elsewhere_is_not_resumed_and_who_has_it_is_said(tmp_
     finally:
         process.kill()
         process.communicate()
-    assert run("--resume", folder, "--steps", 200).returncode == 0  # the lock died with it
+    assert train.main(["--resume", str(folder), "--steps", "200"]) == 0  # the lock died with it
+
+
+@pytest.mark.parametrize("other", ["goes on", "is done"])
+def test_a_folder_taken_while_all_else_was_checked_is_left_to_its_owner(
+    other, register, tmp_path, monkeypatch, capsys
+):
+    folder, make_agent = tmp_path / "run", train.make_agent
+    arguments = ["--env", register(Base), "--run-dir", str(folder), *FAST]
+    lock = filelock.FileLock(folder / "run.lock")
+
+    def meanwhile(*given):
+        monkeypatch.setattr("train.make_agent", make_agent)
+        assert train.main(arguments) == 0
+        if other == "goes on":
+            lock.acquire()
+        before.update(contents(folder))
+        return make_agent(*given)
+
+    before = {}
+    monkeypatch.setattr("train.make_agent", meanwhile)
+    assert train.main(arguments) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert ("in use" if other == "goes on" else "is there already") in said
+    lock.release()
+    assert before and contents(folder) == before
+
+
+def test_two_processes_that_want_one_folder_get_it_once(tmp_path, module):
+    folder = tmp_path / "run"
+    line = mine(folder)
+    done = shell(f"{line} & first=$!; {line}; echo $?; wait $first; echo $?", module)
+    codes = [line for line in done.stdout.decode().splitlines() if line in ("0", "1", "2")]
+    assert sorted(codes) == ["0", "2"] and b"Traceback" not in done.stderr
+    assert len(metrics(folder)) == 2 and (folder / "weights.pt").exists()
 
 
 def test_a_folder_that_cannot_be_filled_is_not_left_behind(register, tmp_path, monkeypatch):
