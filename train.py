@@ -493,7 +493,8 @@ class Run:
         millions = sum(p.numel() for p in self.agent.parameters() if p.requires_grad) / 1e6
         rows = min(s.replay_capacity, s.steps // s.action_repeat)
         return (
-            f"{s.env}, arm {s.arm}, preset {s.preset}, seed {s.seed}: {self.folder}\n"
+            f"{s.env}, arm {s.arm}, preset {s.preset}, seed {s.seed}, from step {self.step:,}: "
+            f"{self.folder}\n"
             f"{millions:.1f} M parameters; {self.machine}; the replay will take "
             f"{rows * row / 1e9:.1f} GB of disk"
         )
@@ -560,12 +561,13 @@ class Run:
             "train_length": float("nan"),
         } | {name: total / count for name, (total, count) in self.averages.items()}
         self.averages, self.visited = {}, []
-        with open(self.folder / "metrics.csv", "a+", newline="") as file:
+        with open(self.folder / "metrics.csv", "a+", newline="", errors="replace") as file:
             file.seek(0)
-            header = next(csv.reader(file), None)  # a resumed run keeps its columns
-            table = csv.DictWriter(file, header or row, "nan", "ignore")
+            header = file.readline().strip().split(",")  # a resumed run keeps its columns
+            known = "env_steps" in header
+            table = csv.DictWriter(file, header if known else row, "nan", "ignore")
             file.seek(0, os.SEEK_END)
-            if header is None:
+            if not known:
                 table.writeheader()
             table.writerow({k: v if isinstance(v, int) else f"{v:.6g}" for k, v in row.items()})
             self.metrics_bytes = file.tell()
@@ -613,8 +615,8 @@ class Run:
         }
         write_whole(newest, content, keep=previous)
 
-    def load(self) -> None:
-        """Go back to the newest whole checkpoint.
+    def load(self) -> dict:
+        """Go back to the newest whole checkpoint. Returns the settings with which it was made.
 
         Raises:
             ValueError: in one sentence, if there is none, or the replay is not its own.
@@ -640,8 +642,9 @@ class Run:
         if machine != self.machine:
             say(f"Begun on {self.machine}, it goes on on {machine}: otherwise than it would have.")
             self.machine = machine
-        if path.name != CHECKPOINTS[0]:  # a damaged one must not take the place of this
-            (self.folder / CHECKPOINTS[0]).unlink(missing_ok=True)
+        damaged = self.folder / CHECKPOINTS[0]
+        if path != damaged and damaged.exists():  # it must not take the place of this
+            damaged.replace(damaged.with_suffix(".damaged"))
         with open(self.folder / "metrics.csv", "a+b") as file:
             file.seek(0)
             whole = file.read(self.metrics_bytes)  # without rows that are younger
@@ -653,6 +656,7 @@ class Run:
         torch.set_rng_state(saved["torch_random"])
         if self.agent.device.type == "cuda" and saved["cuda_random"]:
             torch.cuda.set_rng_state_all(saved["cuda_random"])
+        return made
 
     def retrace(self) -> None:
         """Take the actions of the episode under way again: its environment is then where it was."""
@@ -820,10 +824,10 @@ def read_settings(folder: Path) -> Settings:
     path = folder / "settings.json"
     if not path.is_file():
         raise ValueError(f"{folder} holds no run: there is no settings.json in it.")
-    text = path.read_text(errors="replace")
+    text = path.read_text("utf-8-sig", "replace")
     try:
         saved = dict(json.loads(text))
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, RecursionError) as error:
         raise ValueError(f"{path} cannot be read: {error}.") from None
     if differing := saved.keys() ^ {field.name for field in dataclasses.fields(Settings)}:
         names = ", ".join(sorted(differing))
@@ -886,15 +890,15 @@ def resumed_run(command: Command) -> Run:
     """
     folder = folder_named(command.resume)
     before, after = (dataclasses.asdict(x) for x in (read_settings(folder), command.settings))
-    changed = {name: value for name, value in after.items() if value != before[name]}
-    if command.run_dir or changed.keys() - CHANGEABLE:
-        fixed = ", ".join(sorted(changed.keys() - CHANGEABLE)) or "run_dir"
+    fixed = [name for name in after if after[name] != before[name] and name not in CHANGEABLE]
+    if command.run_dir or fixed:
+        fixed = ", ".join(fixed) or "run_dir"
         raise ValueError(f"--resume keeps the run's own {fixed}; it takes {', '.join(CHANGEABLE)}.")
     run = Run(check(command.settings.to_json()), folder, command.device, command.precision)
     run.open()
-    run.load()
-    for name, value in changed.items():
-        say(f"{name}: {value} in the place of {before[name]} from step {run.step:,} on"
+    before = run.load()  # settings.json may have been edited
+    for name in (name for name in CHANGEABLE if after[name] != before[name]):
+        say(f"{name}: {after[name]} in the place of {before[name]} from step {run.step:,} on"
             + ("; β now falls to its end by then." if name == "steps" else "."))  # fmt: skip
     run.sign()
     return run

@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -60,12 +61,20 @@ def register(monkeypatch):
     return register
 
 
-@pytest.fixture
-def stub_run(register, tmp_path) -> Path:
-    """The folder of a short finished run."""
-    folder = tmp_path / "run"
-    assert train.main(["--env", register(Base), "--run-dir", str(folder), *FAST]) == 0
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("finished") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(gym.registry, "Stub-v0", EnvSpec("Stub-v0", Base))
+        assert train.main(["--env", "Stub-v0", "--run-dir", str(folder), *FAST]) == 0
     return folder
+
+
+@pytest.fixture
+def stub_run(finished, register, tmp_path) -> Path:
+    """The folder of a short finished run."""
+    register(Base)
+    return Path(shutil.copytree(finished, tmp_path / "run"))
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -288,6 +297,36 @@ def test_what_makes_a_run_what_it_is_cannot_be_changed(stub_run, capsys):
     assert contents(stub_run) == before
 
 
+def test_a_rate_edited_in_settings_json_is_said(stub_run, capsys):
+    path = stub_run / "settings.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"model_lr": 1e-5}), "utf-8-sig")
+    assert train.main(["--resume", str(stub_run), "--steps", "180"]) == 0
+    said = capsys.readouterr().err
+    assert "model_lr: 1e-05 in the place of 0.0006 from step 120 on." in said
+    assert train.main(["--resume", str(stub_run)]) == 0
+    assert "in the place of" not in capsys.readouterr().err
+
+
+def test_steps_below_what_was_done_end_the_run_and_lose_nothing(stub_run, capsys):
+    before = metrics(stub_run)
+    assert train.main(["--resume", str(stub_run), "--steps", "80"]) == 0
+    assert "Done" in capsys.readouterr().out
+    assert metrics(stub_run) == before
+
+
+def test_best_is_of_the_whole_run_also_after_it_was_resumed(register, tmp_path, monkeypatch):
+    returns, best = iter([3.0, 9.0, 5.0, 9.0]), []
+    one = train.Episode(*[None] * 5, total=0.0, length=1)
+    monkeypatch.setattr("train.evaluate", lambda *_: [one._replace(total=next(returns))])
+    folder = tmp_path / "run"
+    assert train.main(["--env", register(Base), "--run-dir", str(folder), *FAST]) == 0
+    for steps in ("180", "240"):
+        best.append((folder / "best.pt").read_bytes())
+        assert train.main(["--resume", str(folder), "--steps", steps]) == 0
+    best.append((folder / "best.pt").read_bytes())
+    assert best[0] == best[1] != best[2]  # of equal ones, the later
+
+
 # ---- text and shells -----------------------------------------------------------------------------
 
 
@@ -398,10 +437,39 @@ def test_an_edited_setting_that_made_the_run_what_it_is_is_not_taken(stub_run, c
     assert contents(stub_run) == before
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "7", "null", '"a"', "\0\0", "\ufeff{}"])
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "7", "null", '"a"', "\0\0", "\ufeff{}", "[" * 100_000, '[["a", 1]]']
+)
 def test_settings_that_are_none_are_refused(text, stub_run, capsys):
     (stub_run / "settings.json").write_text(text)
     refused(["--resume", stub_run], capsys, "settings")
+
+
+def test_a_damaged_checkpoint_is_put_aside_and_what_is_gone_on_from_is_said(stub_run, capsys):
+    (stub_run / "checkpoint.pt").unlink()
+    (stub_run / "checkpoint.pt").mkdir()
+    assert train.main(["--resume", str(stub_run)]) == 0
+    said = capsys.readouterr()
+    assert "checkpoint.pt is damaged" in said.err and "from step 0" in said.out
+    assert (stub_run / "checkpoint.damaged").is_dir() and (stub_run / "checkpoint.pt").is_file()
+
+
+@pytest.mark.parametrize("damage", ["no text", "half a row", "half a header", "gone", "longer"])
+def test_damaged_metrics_stop_nothing_and_later_rows_are_whole(damage, stub_run):
+    path, content = stub_run / "metrics.csv", (stub_run / "metrics.csv").read_bytes()
+    if damage == "gone":
+        path.unlink()
+    else:
+        path.write_bytes({
+            "no text": bytes(range(256)) * 1000, "half a row": content[:-50],
+            "half a header": content[:70], "longer": content + b"1,2",
+        }[damage])  # fmt: skip
+    assert train.main(["--resume", str(stub_run), "--steps", "180"]) == 0
+    lines = path.read_bytes().splitlines()
+    header = next(line for line in lines if line.startswith(b"env_steps,"))
+    assert len(header.split(b",")) == len(lines[-1].split(b",")) > 20
+    assert lines[-1].startswith(b"180,") and lines[-1].count(b"nan") < 5
+    assert damage != "longer" or len(metrics(stub_run)) == 3
 
 
 def test_a_run_without_checkpoints_is_refused_and_left_as_it_is(stub_run, capsys):
