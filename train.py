@@ -98,7 +98,7 @@ class Settings:
     units: Size = 400  # of reward, termination, actor and critic layers (Dreamer: 400)
     depth: Size = 32  # channels of the first convolution (Dreamer: 32)
     batch_size: Size = 50  # sequences a batch (Dreamer: 50)
-    length: Size = 50  # rows a sequence (Dreamer: 50)
+    length: Annotated[Size, Interval(ge=2)] = 50  # rows a sequence (Dreamer: 50)
     horizon: Size = 15  # imagined steps, and n of Eq. (10) (Dreamer)
     starts: Share = 1.0  # of a batch's live states, those that actors dream on from (Dreamer: all)
 
@@ -460,8 +460,8 @@ class Run:
         self.step = self.updates = self.episode = 0  # made; made; begun
         self.over, self.length = True, 0  # whether the last episode ended; its environment steps
         self.state: Tensor | None = None  # (1, D), the agent's; None: it has not looked yet
-        self.actions: list[Tensor] = []  # of the episode under way
-        self.visited: list[Tensor] = []  # the environment's own states since the last evaluation
+        self.actions: list[list[float]] = []  # of the episode under way
+        self.visited: list[list[float]] = []  # the environment's own, since the last evaluation
         self.averages: dict[str, list[float]] = {}  # name: [sum, count] since then
         self.evaluated_at, self.best = 0, -float("inf")  # step of the last one; best mean return
         self.saved_rows = self.metrics_bytes = 0  # of replay.bin and metrics.csv, when last saved
@@ -515,8 +515,8 @@ class Run:
         """Count a decision that was taken."""
         before, self.length = self.length, int(self.env.get_wrapper_attr("episode_lengths"))
         self.step, self.over = self.step + self.length - before, over
-        self.actions.append(torch.from_numpy(action))
-        self.visited.append(torch.from_numpy(info["state"]))
+        self.actions.append(action.tolist())  # of numbers: 50,000 tensors take seconds to save
+        self.visited.append(info["state"].tolist())
         if over:
             whole = info["episode"]
             self.average({"train_return": whole["r"], "train_length": whole["l"]})
@@ -556,7 +556,7 @@ class Run:
             "eval_length": lengths.mean(),
             "eval_length_min": lengths.min(),
             "eval_length_max": lengths.max(),
-            "coverage": coverage(torch.stack(self.visited).numpy()),
+            "coverage": coverage(np.array(self.visited)),
             "train_return": float("nan"),  # unless an episode ended
             "train_length": float("nan"),
         } | {name: total / count for name, (total, count) in self.averages.items()}
@@ -667,7 +667,7 @@ class Run:
         try:
             image = self.begin_episode()
             for action in actions:
-                image = self.env.step(action.numpy())[0]
+                image = self.env.step(np.float32(action))[0]
         except EnvironmentFault:
             image = None
         self.actions, self.state, self.length = actions, state, length
@@ -947,8 +947,10 @@ def train_run(run: Run) -> int:
             tqdm(total=run.s.steps, initial=run.step, unit="step", mininterval=every) as run.bar,
             SummaryWriter(run.folder, purge_step=run.step + 1) as run.writer,
         ):
-            for name in ("SIGINT", "SIGTERM", "SIGHUP"):  # Windows has no SIGHUP
-                signal.signal(getattr(signal, name, signal.SIGINT), stop)
+            hangup = getattr(signal, "SIGHUP", signal.SIGINT)  # Windows has none
+            for number in (signal.SIGINT, signal.SIGTERM, hangup):
+                if number != hangup or signal.getsignal(number) != signal.SIG_IGN:  # nohup
+                    signal.signal(number, stop)
             train(run, stopped.is_set)
     except FloatingPointError as error:
         say(f"{error} The last checkpoint is from before: go on from it with a lower --model-lr, "
@@ -957,12 +959,14 @@ def train_run(run: Run) -> int:
         run.over = True  # whoever goes on begins another episode
         with contextlib.suppress(OSError):
             run.save()
-        say(f"{error} What was learnt is saved. {resume}")
+            error = f"{error} What was learnt is saved."
+        say(f"{error} {resume}")
     except (MemoryError, RuntimeError) as error:
         if "alloc" not in str(error) and not isinstance(error, MemoryError):
             raise
         size = f"--batch-size {run.s.batch_size} and --length {run.s.length}"
-        say(f"No memory for an update of {size}: {str(error).splitlines()[0]} {resume}")
+        reason = str(error).partition("\n")[0]  # a MemoryError may have none
+        say(f"No memory for an update of {size}: {reason} {resume}")
     except OSError as error:
         say(f"{error}: stopped; what was saved before is whole. {resume}")
     else:
@@ -974,7 +978,7 @@ def train_run(run: Run) -> int:
 
 def say(text: object) -> None:
     """One sentence for the user, beside the progress."""
-    print(text, file=sys.stderr, flush=True)
+    tqdm.write(" ".join(str(text).splitlines()) or repr(text), file=sys.stderr)
 
 
 def leave_out_os_errors(thrown: threading.ExceptHookArgs) -> None:
