@@ -167,12 +167,18 @@ def act(
 
     Returns:
         the action (A,) and the state (1, D).
+
+    Raises:
+        FloatingPointError: if the action is not finite, lest the environment be blamed for it.
     """
     rows = np.array(image), np.array(action), np.array(state is None)  # B = T = 1
     rows = [torch.from_numpy(x)[None, None].to(agent.device) for x in rows]
     # In float32: to cast all weights costs more than one image's products in bfloat16 save.
     state = agent.model.observe(*rows, previous=state).state[:, 0]
-    return policy(state)[0].cpu().numpy(), state
+    action = policy(state)[0].cpu().numpy()
+    if not np.isfinite(action).all():
+        raise FloatingPointError("Not finite: the actor's action.")
+    return action, state
 
 
 class Episode(NamedTuple):

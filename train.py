@@ -98,7 +98,7 @@ class Settings:
     units: Size = 400  # of reward, termination, actor and critic layers (Dreamer: 400)
     depth: Size = 32  # channels of the first convolution (Dreamer: 32)
     batch_size: Size = 50  # sequences a batch (Dreamer: 50)
-    length: Size = 50  # rows a sequence (Dreamer: 50)
+    length: Annotated[Size, Interval(ge=2)] = 50  # rows a sequence (Dreamer: 50)
     horizon: Size = 15  # imagined steps, and n of Eq. (10) (Dreamer)
     starts: Share = 1.0  # of a batch's live states, those that actors dream on from (Dreamer: all)
 
@@ -460,8 +460,8 @@ class Run:
         self.step = self.updates = self.episode = 0  # made; made; begun
         self.over, self.length = True, 0  # whether the last episode ended; its environment steps
         self.state: Tensor | None = None  # (1, D), the agent's; None: it has not looked yet
-        self.actions: list[Tensor] = []  # of the episode under way
-        self.visited: list[Tensor] = []  # the environment's own states since the last evaluation
+        self.actions: list[list[float]] = []  # of the episode under way
+        self.visited: list[list[float]] = []  # the environment's own, since the last evaluation
         self.averages: dict[str, list[float]] = {}  # name: [sum, count] since then
         self.evaluated_at, self.best = 0, -float("inf")  # step of the last one; best mean return
         self.saved_rows = self.metrics_bytes = 0  # of replay.bin and metrics.csv, when last saved
@@ -493,7 +493,8 @@ class Run:
         millions = sum(p.numel() for p in self.agent.parameters() if p.requires_grad) / 1e6
         rows = min(s.replay_capacity, s.steps // s.action_repeat)
         return (
-            f"{s.env}, arm {s.arm}, preset {s.preset}, seed {s.seed}: {self.folder}\n"
+            f"{s.env}, arm {s.arm}, preset {s.preset}, seed {s.seed}, from step {self.step:,}: "
+            f"{self.folder}\n"
             f"{millions:.1f} M parameters; {self.machine}; the replay will take "
             f"{rows * row / 1e9:.1f} GB of disk"
         )
@@ -514,8 +515,8 @@ class Run:
         """Count a decision that was taken."""
         before, self.length = self.length, int(self.env.get_wrapper_attr("episode_lengths"))
         self.step, self.over = self.step + self.length - before, over
-        self.actions.append(torch.from_numpy(action))
-        self.visited.append(torch.from_numpy(info["state"]))
+        self.actions.append(action.tolist())  # of numbers: 50,000 tensors take seconds to save
+        self.visited.append(info["state"].tolist())
         if over:
             whole = info["episode"]
             self.average({"train_return": whole["r"], "train_length": whole["l"]})
@@ -555,17 +556,18 @@ class Run:
             "eval_length": lengths.mean(),
             "eval_length_min": lengths.min(),
             "eval_length_max": lengths.max(),
-            "coverage": coverage(torch.stack(self.visited).numpy()),
+            "coverage": coverage(np.array(self.visited)),
             "train_return": float("nan"),  # unless an episode ended
             "train_length": float("nan"),
         } | {name: total / count for name, (total, count) in self.averages.items()}
         self.averages, self.visited = {}, []
-        with open(self.folder / "metrics.csv", "a+", newline="") as file:
+        with open(self.folder / "metrics.csv", "a+", newline="", errors="replace") as file:
             file.seek(0)
-            header = next(csv.reader(file), None)  # a resumed run keeps its columns
-            table = csv.DictWriter(file, header or row, "nan", "ignore")
+            header = file.readline().strip().split(",")  # a resumed run keeps its columns
+            known = "env_steps" in header
+            table = csv.DictWriter(file, header if known else row, "nan", "ignore")
             file.seek(0, os.SEEK_END)
-            if header is None:
+            if not known:
                 table.writeheader()
             table.writerow({k: v if isinstance(v, int) else f"{v:.6g}" for k, v in row.items()})
             self.metrics_bytes = file.tell()
@@ -613,8 +615,8 @@ class Run:
         }
         write_whole(newest, content, keep=previous)
 
-    def load(self) -> None:
-        """Go back to the newest whole checkpoint.
+    def load(self) -> dict:
+        """Go back to the newest whole checkpoint. Returns the settings with which it was made.
 
         Raises:
             ValueError: in one sentence, if there is none, or the replay is not its own.
@@ -640,8 +642,9 @@ class Run:
         if machine != self.machine:
             say(f"Begun on {self.machine}, it goes on on {machine}: otherwise than it would have.")
             self.machine = machine
-        if path.name != CHECKPOINTS[0]:  # a damaged one must not take the place of this
-            (self.folder / CHECKPOINTS[0]).unlink(missing_ok=True)
+        damaged = self.folder / CHECKPOINTS[0]
+        if path != damaged and damaged.exists():  # it must not take the place of this
+            damaged.replace(damaged.with_suffix(".damaged"))
         with open(self.folder / "metrics.csv", "a+b") as file:
             file.seek(0)
             whole = file.read(self.metrics_bytes)  # without rows that are younger
@@ -653,6 +656,7 @@ class Run:
         torch.set_rng_state(saved["torch_random"])
         if self.agent.device.type == "cuda" and saved["cuda_random"]:
             torch.cuda.set_rng_state_all(saved["cuda_random"])
+        return made
 
     def retrace(self) -> None:
         """Take the actions of the episode under way again: its environment is then where it was."""
@@ -663,7 +667,7 @@ class Run:
         try:
             image = self.begin_episode()
             for action in actions:
-                image = self.env.step(action.numpy())[0]
+                image = self.env.step(np.float32(action))[0]
         except EnvironmentFault:
             image = None
         self.actions, self.state, self.length = actions, state, length
@@ -778,7 +782,7 @@ def parse(arguments: list[str]) -> Command:
 
     first = parsed(Settings(), [a for a in arguments if a not in ("-h", "--help")])
     if first.resume is not None:
-        return parsed(read_settings(Path(first.resume)), arguments)
+        return parsed(read_settings(folder_named(first.resume)), arguments)
     return parsed(default_settings(first.settings.arm, first.settings.preset), arguments)
 
 
@@ -820,15 +824,27 @@ def read_settings(folder: Path) -> Settings:
     path = folder / "settings.json"
     if not path.is_file():
         raise ValueError(f"{folder} holds no run: there is no settings.json in it.")
-    text = path.read_text(errors="replace")
+    text = path.read_text("utf-8-sig", "replace")
     try:
         saved = dict(json.loads(text))
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, RecursionError) as error:
         raise ValueError(f"{path} cannot be read: {error}.") from None
     if differing := saved.keys() ^ {field.name for field in dataclasses.fields(Settings)}:
         names = ", ".join(sorted(differing))
         raise ValueError(f"{folder} was made by a version with other settings: {names}.")
     return check(text, f"{path}: ")
+
+
+def folder_named(text: str) -> Path:
+    """The folder that a user names, wherever the environment goes.
+
+    Raises:
+        ValueError: in one sentence, if its name is not UTF-8, as TensorBoard's files want it.
+    """
+    path = os.path.abspath(os.path.expanduser(text))
+    if path != path.encode(errors="ignore").decode():
+        raise ValueError(f"{path!a} is not UTF-8: name another folder.")
+    return Path(path)
 
 
 def new_run(command: Command) -> Run:
@@ -839,9 +855,10 @@ def new_run(command: Command) -> Run:
     """
     s = check(command.settings.to_json())
     name = f"{s.env}-{s.arm}-{s.preset}-seed{s.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
-    folder = Path(command.run_dir or "runs/" + re.sub(r"[^\w.-]", "-", name))
+    folder = folder_named(command.run_dir or "runs/" + re.sub(r"[^\w.-]", "-", name))
+    taken = f"{folder} is there already: name another --run-dir, or --resume it."
     if command.run_dir and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ValueError(f"{folder} is there already: name another --run-dir, or --resume it.")
+        raise ValueError(taken)
     run = Run(s, folder, command.device, command.precision)
     while True:
         try:
@@ -853,8 +870,12 @@ def new_run(command: Command) -> Run:
             run.folder = run.folder.with_name(run.folder.name + "+")
     try:
         run.open()
+        if (run.folder / "settings.json").exists():  # of a process that was faster, and is done
+            raise ValueError(taken)
         run.save()
         run.sign()
+    except ValueError:  # the folder is another's
+        raise
     except BaseException:
         shutil.rmtree(run.folder, ignore_errors=True)
         raise
@@ -867,17 +888,17 @@ def resumed_run(command: Command) -> Run:
     Raises:
         ValueError: in one sentence, why it cannot go on, or not with these settings.
     """
-    folder = Path(command.resume)
+    folder = folder_named(command.resume)
     before, after = (dataclasses.asdict(x) for x in (read_settings(folder), command.settings))
-    changed = {name: value for name, value in after.items() if value != before[name]}
-    if command.run_dir or changed.keys() - CHANGEABLE:
-        fixed = ", ".join(sorted(changed.keys() - CHANGEABLE)) or "run_dir"
+    fixed = [name for name in after if after[name] != before[name] and name not in CHANGEABLE]
+    if command.run_dir or fixed:
+        fixed = ", ".join(fixed) or "run_dir"
         raise ValueError(f"--resume keeps the run's own {fixed}; it takes {', '.join(CHANGEABLE)}.")
     run = Run(check(command.settings.to_json()), folder, command.device, command.precision)
     run.open()
-    run.load()
-    for name, value in changed.items():
-        say(f"{name}: {value} in the place of {before[name]} from step {run.step:,} on"
+    before = run.load()  # settings.json may have been edited
+    for name in (name for name in CHANGEABLE if after[name] != before[name]):
+        say(f"{name}: {after[name]} in the place of {before[name]} from step {run.step:,} on"
             + ("; β now falls to its end by then." if name == "steps" else "."))  # fmt: skip
     run.sign()
     return run
@@ -926,8 +947,10 @@ def train_run(run: Run) -> int:
             tqdm(total=run.s.steps, initial=run.step, unit="step", mininterval=every) as run.bar,
             SummaryWriter(run.folder, purge_step=run.step + 1) as run.writer,
         ):
-            for name in ("SIGINT", "SIGTERM", "SIGHUP"):  # Windows has no SIGHUP
-                signal.signal(getattr(signal, name, signal.SIGINT), stop)
+            hangup = getattr(signal, "SIGHUP", signal.SIGINT)  # Windows has none
+            for number in (signal.SIGINT, signal.SIGTERM, hangup):
+                if number != hangup or signal.getsignal(number) != signal.SIG_IGN:  # nohup
+                    signal.signal(number, stop)
             train(run, stopped.is_set)
     except FloatingPointError as error:
         say(f"{error} The last checkpoint is from before: go on from it with a lower --model-lr, "
@@ -936,12 +959,14 @@ def train_run(run: Run) -> int:
         run.over = True  # whoever goes on begins another episode
         with contextlib.suppress(OSError):
             run.save()
-        say(f"{error} What was learnt is saved. {resume}")
+            error = f"{error} What was learnt is saved."
+        say(f"{error} {resume}")
     except (MemoryError, RuntimeError) as error:
         if "alloc" not in str(error) and not isinstance(error, MemoryError):
             raise
         size = f"--batch-size {run.s.batch_size} and --length {run.s.length}"
-        say(f"No memory for an update of {size}: {str(error).splitlines()[0]} {resume}")
+        reason = str(error).partition("\n")[0]  # a MemoryError may have none
+        say(f"No memory for an update of {size}: {reason} {resume}")
     except OSError as error:
         say(f"{error}: stopped; what was saved before is whole. {resume}")
     else:
@@ -953,7 +978,7 @@ def train_run(run: Run) -> int:
 
 def say(text: object) -> None:
     """One sentence for the user, beside the progress."""
-    print(text, file=sys.stderr, flush=True)
+    tqdm.write(" ".join(str(text).splitlines()) or repr(text), file=sys.stderr)
 
 
 def leave_out_os_errors(thrown: threading.ExceptHookArgs) -> None:

@@ -4,12 +4,15 @@ import csv
 import json
 import os
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 from typing import ClassVar
 
+import filelock
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -59,12 +62,20 @@ def register(monkeypatch):
     return register
 
 
-@pytest.fixture
-def stub_run(register, tmp_path) -> Path:
-    """The folder of a short finished run."""
-    folder = tmp_path / "run"
-    assert train.main(["--env", register(Base), "--run-dir", str(folder), *FAST]) == 0
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("finished") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(gym.registry, "Stub-v0", EnvSpec("Stub-v0", Base))
+        assert train.main(["--env", "Stub-v0", "--run-dir", str(folder), *FAST]) == 0
     return folder
+
+
+@pytest.fixture
+def stub_run(finished, register, tmp_path) -> Path:
+    """The folder of a short finished run."""
+    register(Base)
+    return Path(shutil.copytree(finished, tmp_path / "run"))
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -93,18 +104,50 @@ def test_runs_begun_in_the_same_second_have_a_folder_each(register, tmp_path, mo
     assert all(len(metrics(folder)) == 2 for folder in folders)
 
 
-def test_a_run_that_goes_on_elsewhere_is_not_resumed_and_who_has_it_is_said(tmp_path):
+def test_a_run_that_goes_on_elsewhere_is_not_resumed_and_who_has_it_is_said(tmp_path, capsys):
     folder = tmp_path / "run"
     process = start("--run-dir", folder, *LONG, "--steps", 100_000)
     try:
         wait_for(folder / "settings.json", process)
-        second = run("--resume", folder)
-        assert second.returncode == 2 and one_sentence(second.stderr)
-        assert str(process.pid) in second.stderr
+        refused(["--resume", folder], capsys, str(process.pid))
     finally:
         process.kill()
         process.communicate()
-    assert run("--resume", folder, "--steps", 200).returncode == 0  # the lock died with it
+    assert train.main(["--resume", str(folder), "--steps", "200"]) == 0  # the lock died with it
+
+
+@pytest.mark.parametrize("other", ["goes on", "is done"])
+def test_a_folder_taken_while_all_else_was_checked_is_left_to_its_owner(
+    other, register, tmp_path, monkeypatch, capsys
+):
+    folder, make_agent = tmp_path / "run", train.make_agent
+    arguments = ["--env", register(Base), "--run-dir", str(folder), *FAST]
+    lock = filelock.FileLock(folder / "run.lock")
+
+    def meanwhile(*given):
+        monkeypatch.setattr("train.make_agent", make_agent)
+        assert train.main(arguments) == 0
+        if other == "goes on":
+            lock.acquire()
+        before.update(contents(folder))
+        return make_agent(*given)
+
+    before = {}
+    monkeypatch.setattr("train.make_agent", meanwhile)
+    assert train.main(arguments) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert ("in use" if other == "goes on" else "is there already") in said
+    lock.release()
+    assert before and contents(folder) == before
+
+
+def test_two_processes_that_want_one_folder_get_it_once(tmp_path, module):
+    folder = tmp_path / "run"
+    line = mine(folder)
+    done = shell(f"{line} & first=$!; {line}; echo $?; wait $first; echo $?", module)
+    codes = [line for line in done.stdout.decode().splitlines() if line in ("0", "1", "2")]
+    assert sorted(codes) == ["0", "2"] and b"Traceback" not in done.stderr
+    assert len(metrics(folder)) == 2 and (folder / "weights.pt").exists()
 
 
 def test_a_folder_that_cannot_be_filled_is_not_left_behind(register, tmp_path, monkeypatch):
@@ -150,6 +193,18 @@ def test_an_evaluation_of_an_endless_episode_ends(register, tmp_path):
     assert [row["eval_length"] for row in metrics(folder)] == ["30", "30"]
 
 
+def test_an_episode_that_never_ends_makes_no_checkpoint_of_many_parts(register, tmp_path):
+    """A part of a checkpoint for each action of the episode took 11 s after 50,000 of them."""
+    folder, parts = tmp_path / "run", []
+    arguments = ["--env", register(Endless), "--run-dir", str(folder), "--eval-max-steps", "30"]
+    assert train.main([*arguments, *FAST]) == 0
+    for steps in ("180", "240"):
+        with zipfile.ZipFile(folder / "checkpoint.pt") as file:
+            parts.append(len(file.namelist()))
+        assert train.main(["--resume", str(folder), "--steps", steps]) == 0
+    assert parts[0] == parts[1]
+
+
 # ---- environments that fail later ----------------------------------------------------------------
 
 
@@ -176,9 +231,28 @@ class Enormous(Fails):
         return result[0], 1e30, *result[2:]
 
 
-@pytest.mark.parametrize(
-    "environment, word", [(Raises, "ZeroDivisionError"), (NoNumber, "nan"), (Enormous, "1e+30")]
-)
+class Leaves(Fails):
+    def fail(self, result):
+        sys.exit("bye")
+
+
+class RaisesAtReset(Base):
+    def reset(self, **given):
+        if self.steps > 80:
+            raise RuntimeError("could not\nallocate")
+        return super().reset(**given)
+
+
+class RaisesWhenItRenders(Base):
+    def render(self):
+        assert self.steps not in (90, 91), "no screen"
+        return super().render()
+
+
+@pytest.mark.parametrize("environment, word", [
+    (Raises, "ZeroDivisionError"), (NoNumber, "nan"), (Enormous, "1e+30"), (Leaves, "SystemExit"),
+    (RaisesAtReset, "could not allocate"), (RaisesWhenItRenders, "no screen"),
+])  # fmt: skip
 def test_what_an_environment_does_later_is_one_sentence_that_names_it(
     environment, word, register, tmp_path, capfd
 ):
@@ -188,13 +262,28 @@ def test_what_an_environment_does_later_is_one_sentence_that_names_it(
     assert "Traceback" not in said and f"{name} " in said and word in said
     assert "--model-lr" not in said
     kept = train.read_checkpoint(folder)[1]["kept"]
-    assert 80 < kept["step"] < 90 and kept["over"]  # what was learnt is saved; another follows
-    assert train.main(["--resume", str(folder)]) == 0  # this process's is past its 90th step
+    assert "What was learnt is saved." in said
+    assert 80 <= kept["step"] < 100 and kept["over"]  # what was learnt is saved; another follows
+    assert train.main(["--resume", str(folder)]) == 0  # another one, whose steps are fewer
     assert len(metrics(folder)) == 2
 
 
-class FailsWhenEvaluated(Base):
-    """The second of a run's two environments is that of its evaluations."""
+def test_nothing_is_said_to_be_saved_that_is_not(register, tmp_path, monkeypatch, capfd):
+    def full(run):
+        if run.step:
+            raise OSError(28, "No space left on device")
+        save(run)
+
+    save = train.Run.save
+    monkeypatch.setattr("train.Run.save", full)
+    arguments = ["--env", register(Raises), "--run-dir", str(tmp_path / "run"), *FAST]
+    assert train.main(arguments) == 1
+    said = capfd.readouterr().err
+    assert "ZeroDivisionError" in said and "saved" not in said and "Traceback" not in said
+
+
+class Second(Base):
+    """Knows its number: the second of a run's two environments is that of its evaluations."""
 
     made = 0
 
@@ -203,6 +292,8 @@ class FailsWhenEvaluated(Base):
         type(self).made += 1
         self.number = self.made
 
+
+class FailsWhenEvaluated(Second):
     def step(self, action):
         if self.number == 2 and self.steps > 5:
             raise OSError("no")
@@ -211,10 +302,28 @@ class FailsWhenEvaluated(Base):
 
 def test_an_environment_that_fails_in_an_evaluation_stops_nothing(register, tmp_path, capfd):
     folder = tmp_path / "run"
-    FailsWhenEvaluated.made = 0
+    Second.made = FailsWhenEvaluated.made = 0
     assert train.main(["--env", register(FailsWhenEvaluated), "--run-dir", str(folder), *FAST]) == 0
     assert "left out: Stub-v0 raised OSError" in capfd.readouterr().err
     assert (folder / "weights.pt").exists()
+
+
+def test_an_action_that_is_not_finite_is_not_the_environments_fault(
+    register, tmp_path, monkeypatch, capfd
+):
+    folder = tmp_path / "run"
+
+    def mode(actor, state):
+        checkpoints.update(contents(folder))
+        return state[..., :2] * float("nan")
+
+    checkpoints = {}
+    monkeypatch.setattr("actors.DeterministicActor.mode", mode)
+    name = register(Base)
+    assert train.main(["--env", name, "--run-dir", str(folder), *FAST]) == 1
+    said = capfd.readouterr().err
+    assert "Not finite" in said and "action" in said and f"{name} gave" not in said
+    assert (folder / "checkpoint.pt").read_bytes() == checkpoints["checkpoint.pt"]
 
 
 # ---- facts of the machine ------------------------------------------------------------------------
@@ -230,6 +339,60 @@ def test_a_run_holds_nothing_of_its_machine_and_may_move(stub_run, register, cap
     said = capsys.readouterr().err
     was = "bfloat16" if train.has_bfloat16(torch.device("cpu")) else "float32"
     assert ("otherwise than it would have" in said) == (was == "bfloat16")
+
+
+class Signalled(Second):
+    """Sends its own process a signal, in training or in an evaluation, and goes elsewhere."""
+
+    which, number_sent = 1, signal.SIGTERM
+
+    def step(self, action):
+        os.chdir("/")
+        if (self.number, self.steps) == (self.which, 90 if self.which == 1 else 12):
+            os.kill(os.getpid(), self.number_sent)
+        return super().step(action)
+
+
+@pytest.fixture
+def signals():
+    """Leaves to the other tests the handlers that they had."""
+    numbers = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+    before = [signal.getsignal(number) for number in numbers]
+    yield
+    for number, handler in zip(numbers, before, strict=True):
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("which, number, name", [
+    (1, signal.SIGTERM, "-dash"), (2, signal.SIGTERM, "a folder/with blanks/"),
+    (1, signal.SIGHUP, "~/run"), (2, signal.SIGINT, "plain"),
+])  # fmt: skip
+def test_a_run_stopped_anywhere_goes_on_by_its_own_advice_as_if_it_had_not(
+    which, number, name, finished, register, tmp_path, monkeypatch, capfd, signals
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setattr(Signalled, "made", 0)
+    monkeypatch.setattr(Signalled, "which", which)
+    monkeypatch.setattr(Signalled, "number_sent", number)
+    env = register(Signalled)
+    assert train.main(["--env", env, f"--run-dir={name}", *FAST]) == 0
+    assert Path.cwd() == Path("/")
+    advice = shlex.split(capfd.readouterr().out.split("Go on with: ")[1])
+    assert Path(advice[0]) == Path(sys.executable) and Path(advice[1]) == Path(train.__file__)
+    assert train.main(advice[2:]) == 0
+    assert "Done" in capfd.readouterr().out
+    assert metrics(tmp_path / name.removeprefix("~/")) == metrics(finished)
+
+
+@pytest.mark.skipif(not Path("/usr/bin/nohup").exists(), reason="there is no nohup")
+def test_a_run_under_nohup_outlives_its_terminal(tmp_path, module):
+    folder = tmp_path / "run"
+    line = f"nohup {mine(folder)} --checkpoint-minutes 0 & run=$!; "
+    line += f"until [ -e {folder}/best.pt ]; do sleep 0.05; done; kill -HUP $run; wait $run"
+    done = shell(line, module)
+    assert done.returncode == 0 and b"Stopped" not in done.stdout
+    assert (folder / "weights.pt").exists()
 
 
 def test_a_finished_run_can_be_made_longer_and_says_what_changed(stub_run, capsys):
@@ -251,6 +414,36 @@ def test_what_makes_a_run_what_it_is_cannot_be_changed(stub_run, capsys):
     refused(["--resume", stub_run, "--gamma", "0.5"], capsys, "gamma")
     refused(["--resume", stub_run, "--run-dir", "x"], capsys, "run_dir")
     assert contents(stub_run) == before
+
+
+def test_a_rate_edited_in_settings_json_is_said(stub_run, capsys):
+    path = stub_run / "settings.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"model_lr": 1e-5}), "utf-8-sig")
+    assert train.main(["--resume", str(stub_run), "--steps", "180"]) == 0
+    said = capsys.readouterr().err
+    assert "model_lr: 1e-05 in the place of 0.0006 from step 120 on." in said
+    assert train.main(["--resume", str(stub_run)]) == 0
+    assert "in the place of" not in capsys.readouterr().err
+
+
+def test_steps_below_what_was_done_end_the_run_and_lose_nothing(stub_run, capsys):
+    before = metrics(stub_run)
+    assert train.main(["--resume", str(stub_run), "--steps", "80"]) == 0
+    assert "Done" in capsys.readouterr().out
+    assert metrics(stub_run) == before
+
+
+def test_best_is_of_the_whole_run_also_after_it_was_resumed(register, tmp_path, monkeypatch):
+    returns, best = iter([3.0, 9.0, 5.0, 9.0]), []
+    one = train.Episode(*[None] * 5, total=0.0, length=1)
+    monkeypatch.setattr("train.evaluate", lambda *_: [one._replace(total=next(returns))])
+    folder = tmp_path / "run"
+    assert train.main(["--env", register(Base), "--run-dir", str(folder), *FAST]) == 0
+    for steps in ("180", "240"):
+        best.append((folder / "best.pt").read_bytes())
+        assert train.main(["--resume", str(folder), "--steps", steps]) == 0
+    best.append((folder / "best.pt").read_bytes())
+    assert best[0] == best[1] != best[2]  # of equal ones, the later
 
 
 # ---- text and shells -----------------------------------------------------------------------------
@@ -281,29 +474,28 @@ def mine(folder: Path) -> str:
 def test_a_terminal_that_knows_few_letters_stops_nothing(encoding, tmp_path, module):
     done = shell(mine(tmp_path / "run"), module, PYTHONIOENCODING=encoding)
     assert done.returncode == 0 and b"Traceback" not in done.stderr, done.stderr
+    assert b"argv[0]" not in done.stdout + done.stderr and b"pybullet" not in done.stderr
     help_text = shell(shlex.join(command("--help")), module, PYTHONIOENCODING=encoding)
     assert help_text.returncode == 0 and b"--beta-start" in help_text.stdout
 
 
-@pytest.mark.parametrize("ending", ["| head -c 1", "> /dev/full", ">&-", "2>&-", "2> /dev/full"])
+@pytest.mark.parametrize(
+    "ending", ["| head -c 1", "> /dev/full 2> /dev/full", ">&- 2>&- <&-", "2>&1 | head -c 1"]
+)
 def test_a_reader_who_goes_away_stops_nothing(ending, tmp_path, module):
     folder = tmp_path / "run"
-    done = shell(f"set -o pipefail; {mine(folder)} {ending}", module)
+    strict = mine(folder).replace(sys.executable, f"{sys.executable} -W error", 1)
+    done = shell(f"set -o pipefail; {strict} {ending}", module, COLUMNS="20", TERM="dumb")
     assert b"Traceback" not in done.stderr and b"Exception" not in done.stderr, done.stderr
     assert done.returncode == 0 and len(metrics(folder)) == 2
 
 
-def test_nothing_but_our_own_words_is_on_the_terminal(tmp_path, module):
-    done = shell(mine(tmp_path / "run"), module)
-    assert b"argv[0]" not in done.stdout + done.stderr and b"pybullet" not in done.stderr
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_a_schedulers_signal_and_a_closed_terminal_save_as_ctrl_c_does(number, tmp_path):
+@pytest.mark.slow
+def test_a_schedulers_signal_saves_as_ctrl_c_does(tmp_path):
     folder = tmp_path / "a folder with spaces"
     process = start("--run-dir", folder, *LONG)
     wait_for(folder / "checkpoint.previous.pt", process)
-    process.send_signal(number)
+    process.send_signal(signal.SIGTERM)
     said, errors = process.communicate()
     assert process.returncode == 0, errors
     advice = shlex.split(said.split("Go on with: ")[1])
@@ -363,10 +555,39 @@ def test_an_edited_setting_that_made_the_run_what_it_is_is_not_taken(stub_run, c
     assert contents(stub_run) == before
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "7", "null", '"a"', "\0\0", "\ufeff{}"])
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "7", "null", '"a"', "\0\0", "\ufeff{}", "[" * 100_000, '[["a", 1]]']
+)
 def test_settings_that_are_none_are_refused(text, stub_run, capsys):
     (stub_run / "settings.json").write_text(text)
     refused(["--resume", stub_run], capsys, "settings")
+
+
+def test_a_damaged_checkpoint_is_put_aside_and_what_is_gone_on_from_is_said(stub_run, capsys):
+    (stub_run / "checkpoint.pt").unlink()
+    (stub_run / "checkpoint.pt").mkdir()
+    assert train.main(["--resume", str(stub_run)]) == 0
+    said = capsys.readouterr()
+    assert "checkpoint.pt is damaged" in said.err and "from step 0" in said.out
+    assert (stub_run / "checkpoint.damaged").is_dir() and (stub_run / "checkpoint.pt").is_file()
+
+
+@pytest.mark.parametrize("damage", ["no text", "half a row", "half a header", "gone", "longer"])
+def test_damaged_metrics_stop_nothing_and_later_rows_are_whole(damage, stub_run):
+    path, content = stub_run / "metrics.csv", (stub_run / "metrics.csv").read_bytes()
+    if damage == "gone":
+        path.unlink()
+    else:
+        path.write_bytes({
+            "no text": bytes(range(256)) * 1000, "half a row": content[:-50],
+            "half a header": content[:70], "longer": content + b"1,2",
+        }[damage])  # fmt: skip
+    assert train.main(["--resume", str(stub_run), "--steps", "180"]) == 0
+    lines = path.read_bytes().splitlines()
+    header = next(line for line in lines if line.startswith(b"env_steps,"))
+    assert len(header.split(b",")) == len(lines[-1].split(b",")) > 20
+    assert lines[-1].startswith(b"180,") and lines[-1].count(b"nan") < 5
+    assert damage != "longer" or len(metrics(stub_run)) == 3
 
 
 def test_a_run_without_checkpoints_is_refused_and_left_as_it_is(stub_run, capsys):
@@ -411,6 +632,30 @@ def test_memory_that_runs_out_in_an_update_names_what_asked_for_it(
     assert train.main(["--env", register(Base), "--run-dir", str(folder), *FAST]) == 1
     said = capfd.readouterr().err
     assert "Traceback" not in said and "--batch-size 3" in said and "--resume" in said
+
+    def nothing(*_):
+        raise MemoryError
+
+    monkeypatch.setattr("env.Replay.sample", nothing)
+    assert train.main(["--resume", str(folder)]) == 1
+    assert "Traceback" not in capfd.readouterr().err
+
+
+# ---- the command line ----------------------------------------------------------------------------
+
+
+def test_bad_input_is_named_in_one_line_whatever_the_terminal(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "20")
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.chdir(tmp_path)
+    refused(["--bath-size", "3"], capsys, "--bath-size", "--batch-size")
+    refused(["--arm", "maxxent"], capsys, "--arm", "maxxent", "dreamer-maxent")
+    refused(["--steps", "1e5"], capsys, "--steps", "1e5")
+    refused(["--env", "two\nlines"], capsys, "two lines")
+    refused(["--length", "1"], capsys, "--length")
+    refused(["--run-dir", "\udcff"], capsys, "UTF-8")  # as Python reads it in the C locale
+    refused(["--resume", "\udcff"], capsys, "UTF-8")
+    assert list(tmp_path.iterdir()) == []
 
 
 # ---- what is kept --------------------------------------------------------------------------------
