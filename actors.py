@@ -113,39 +113,31 @@ def actor_loss(returns: Tensor, continues: Tensor, first_state_only: bool) -> Te
 
 
 def critic_loss(critic: nn.Module, dream, returns: Tensor, smooth_l1: bool) -> Tensor:
-    """Regression of the critic on R_0 … R_{H−1}, weighted by survival (§4.2): a scalar.
-
-    Gradient flows into the critic alone.
+    """Regression of the critic on R_0 … R_{H−1}, weighted by survival (§4.2): a scalar. Gradient
+    flows into the critic alone.
 
     Smooth L1 with its knee at 1 (minor modification 2), or ½(Q − R)². Smooth L1 does not estimate a
     mean: of returns that are 0 nine times in ten and 10 once it makes 1/9, where the mean is 1.
     """
     value = critic(dream.state[:-1].detach(), dream.action[:-1].detach())
     target = returns.detach()
-    error = (
-        F.smooth_l1_loss(value, target, reduction="none")
-        if smooth_l1
-        else 0.5 * (value - target).square()
-    )
+    error = 0.5 * (value - target).square()
+    if smooth_l1:
+        error = F.smooth_l1_loss(value, target, reduction="none")
     return (survival(dream.continues) * error).mean()
 
 
 def nudge(action: Tensor, std: float) -> Tensor:
     """An action with a little reparametrised noise: the first of the deterministic actor's dream.
-
-    Without it Q would only ever be fitted at a = A(s), and its slope ∂Q/∂a there be chance. A
-    departure: the paper has no such noise.
-    """
+    Without it Q would only ever be fitted at a = A(s), and its slope ∂Q/∂a there be chance."""
     return (action + std * torch.randn_like(action)).clamp(-1, 1)
 
 
 def explore(
     action: np.ndarray, noise: float, random_probability: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """The action that collection takes (§4.2, minor modification 4).
-
-    The given one with Gaussian noise, clipped to [−1, 1], or with a probability a uniform one.
-    """
+    """The action that collection takes (§4.2, minor modification 4): the given one with Gaussian
+    noise, clipped to [−1, 1], or with a probability a uniform one."""
     if rng.random() < random_probability:
         return rng.uniform(-1, 1, action.shape).astype(np.float32)
     noisy = action + noise * rng.standard_normal(action.shape)
@@ -166,10 +158,8 @@ def act(
         state: (1, D), the last one; None at the first image that is looked at.
 
     Returns:
-        the action (A,) and the state (1, D).
-
-    Raises:
-        FloatingPointError: if the action is not finite, lest the environment be blamed for it.
+        the action (A,) and the state (1, D). A FloatingPointError if the action is not finite, lest
+        the environment be blamed for it.
     """
     rows = np.array(image), np.array(action), np.array(state is None)  # B = T = 1
     rows = [torch.from_numpy(x)[None, None].to(agent.device) for x in rows]

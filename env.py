@@ -1,9 +1,8 @@
 """Experience: environments seen through their pixels, the replay buffer of what was seen, and
 how much of the environment's own states that covers.
 
-The observation is the rendered 64×64 image and nothing else (§5). Rows of experience are
-arrival-indexed: an observation stands beside the action that led to it and the reward and
-termination received with it.
+The observation is the rendered 64×64 image and nothing else (§5). Rows are arrival-indexed: an
+observation stands beside the action that led to it, and the reward and termination received.
 """
 
 import contextlib
@@ -38,8 +37,7 @@ def silence():
                 last.callback(os.close, copy := os.dup(stream))
                 last.callback(os.dup2, copy, stream)
                 os.dup2(null.fileno(), stream)
-        if hasattr(ctypes.pythonapi, "fflush"):  # else C prints later, to a pipe; not on Windows
-            last.callback(ctypes.pythonapi.fflush, None)
+        last.callback(ctypes.pythonapi.fflush, None)  # else C prints later, to a pipe
         yield
 
 
@@ -69,19 +67,13 @@ def blame(env_id: str, when: str = ""):
         raise EnvironmentFault(" ".join(f"{env_id} {what} {when}".split()) + ".") from error
 
 
-def make_env(
-    env_id: str,
-    action_repeat: int = 2,
-    camera_distance: float | None = None,
-    floor_brightness: float = 1.0,
-) -> gym.Env:
+def make_env(env_id: str, action_repeat=2, camera_distance=None, floor_brightness=1.0) -> gym.Env:
     """An environment whose observation is its 64×64×3 uint8 image and whose actions lie in [−1, 1].
 
     Each action is repeated, its rewards summed, up to the end of the episode; `terminated` and
     `truncated` stay apart. info["state"] is what the agent never sees, see `Foreign`; the last
     step's info["episode"] holds return "r" and length "l" in environment steps;
-    metadata["render_fps"] counts decisions. What the environment does wrong later is raised as
-    `EnvironmentFault`.
+    metadata["render_fps"] counts decisions.
 
     Args:
         env_id: any environment with bounded `Box` actions that renders `rgb_array`, by its
@@ -91,6 +83,7 @@ def make_env(
 
     Raises:
         ValueError: in one sentence, what is wrong with `env_id` and what to do.
+        EnvironmentFault: later, from `reset` and `step`.
     """
     env = None
     try:
@@ -111,11 +104,8 @@ def make_env(
 
 
 def find_spec(env_id: str) -> gym.envs.registration.EnvSpec:
-    """The environment of that name, after the import of the module before its colon, if any.
-
-    Raises:
-        EnvironmentFault: if there is none, with those of a similar name.
-    """
+    """The environment of that name, after the import of the module before its colon, if any. The
+    EnvironmentFault that there is none names similar ones."""
     module, colon, name = env_id.rpartition(":")
     if colon:
         with blame(env_id):
@@ -130,13 +120,9 @@ def find_spec(env_id: str) -> gym.envs.registration.EnvSpec:
 
 
 def set_up_pybullet(robot: gym.Env, camera_distance: float | None, floor_brightness: float) -> None:
-    """Loads a PyBullet robot's world.
-
-    Args:
-        camera_distance: metres from the camera to the robot (None: the environment's own).
-        floor_brightness: factor on the floor's texture. Its bright checkerboard is most of the
-            image loss, yet the only cue of forward speed: dim it, but leave it to be seen.
-    """
+    """Loads a PyBullet robot's world, with the camera at a distance in metres (None: its own) and
+    a factor on the floor's texture. Its bright checkerboard is most of the image loss, yet the only
+    cue of forward speed: dim it, but leave it to be seen."""
     robot._render_width = robot._render_height = IMAGE_SIZE  # never resized from 320×240
     if camera_distance is not None:
         robot._cam_dist = camera_distance
@@ -160,11 +146,8 @@ def resize(image: np.ndarray) -> np.ndarray:
 
 
 def to_pixels(image) -> np.ndarray:
-    """A new (64, 64, 3) uint8 image of one that is grey, RGB or RGBA (alpha is dropped).
-
-    Raises:
-        EnvironmentFault: for what is neither bool, nor integers in 0 … 255, nor floats in 0 … 1.
-    """
+    """A new (64, 64, 3) uint8 image of one that is grey, RGB or RGBA (alpha is dropped). An
+    EnvironmentFault for what is neither bool, nor integers in 0 … 255, nor floats in 0 … 1."""
     image = np.asarray(image)
     image = image[..., None] if image.ndim == 2 else image
     white = 255 if image.dtype.kind in "iu" else 1
@@ -183,13 +166,11 @@ def to_pixels(image) -> np.ndarray:
 class Foreign(gym.Wrapper, gym.utils.RecordConstructorArgs):
     """The door to somebody else's environment: what comes in is copied, checked, and converted if
     it has one meaning; what goes out, an action in [−1, 1], is mapped into the environment's box.
+    Whatever it does wrong is raised as an EnvironmentFault, by all methods.
 
     It begins with a reset, an image and a step, so that what is wrong shows at once. info["state"]
     is the environment's own observation as a new float64 vector of constant size: nan where it is
     not what its space says; empty if it has more than 64 numbers, or no fixed number of them.
-
-    Raises:
-        EnvironmentFault: in all methods, for whatever the environment does.
     """
 
     render_mode = "rgb_array"
@@ -276,8 +257,8 @@ def coverage(states: np.ndarray, k: int = 3) -> float:
         k: neighbours; more have less variance and more bias.
 
     Returns:
-        nats; nan for fewer than k + 1 states, if any is not finite, and for no dimensions or more
-        than 64, where the estimate means nothing and takes minutes.
+        nats; nan for k states or fewer, if any is not finite, and for no dimensions or more than
+        64, where the estimate means nothing and takes minutes.
     """
     try:
         states = np.asarray(states, np.float64)
@@ -295,10 +276,8 @@ def coverage(states: np.ndarray, k: int = 3) -> float:
 
 
 class Replay:
-    """A ring of rows of experience, sampled as windows of consecutive rows.
-
-    A row is a record of image, action, reward, terminated and is_first: one array, one copy of each
-    observation. With a file, the array is that file, mapped: its memory is the page cache's.
+    """A ring of rows of experience, sampled as windows of consecutive rows: records in one array.
+    With a file, the array is that file, mapped: its memory is the page cache's.
 
     Args:
         capacity: newest rows that are sampled; older ones are overwritten.
@@ -344,11 +323,7 @@ class Replay:
         self.rows = np.asarray(self.file)[: whole * self.dtype.itemsize].view(self.dtype)
 
     def add(self, image, action=0.0, reward=0.0, terminated=False, is_first=False) -> None:
-        """Append one row. A reset's has action and reward 0: `add(image, is_first=True)`.
-
-        Raises:
-            OSError: if the disk is full.
-        """
+        """Append one row, of a reset without action and reward. An OSError if the disk is full."""
         at = self.added % self.ring
         if at == len(self.rows):
             self.grow()
@@ -370,11 +345,8 @@ class Replay:
         return self.checksums[np.arange(self.added - len(self), self.added) % self.ring]
 
     def restore(self, added: int, checksums: np.ndarray) -> None:
-        """Go back to when `added` rows had been added and `flush` returned these checksums.
-
-        Raises:
-            ValueError: in one sentence, if the file does not hold those rows.
-        """
+        """Go back to when `added` rows had been added and `flush` returned these checksums. A
+        ValueError, in one sentence, if the file does not hold those rows."""
         self.added = added
         if added == 0:
             return
@@ -390,12 +362,8 @@ class Replay:
 
     def sample(self, batch: int, length: int, rng: np.random.Generator) -> np.ndarray:
         """`batch` windows of `length` consecutive rows, each equally likely, as records (B, T).
-
-        Windows may cross episodes; none crosses the write head, where time jumps.
-
-        Raises:
-            ValueError: if fewer than `length` rows were added.
-        """
+        They may cross episodes; none crosses the write head, where time jumps. A ValueError if
+        fewer rows were added."""
         if len(self) < length:
             raise ValueError(f"The replay holds {len(self)} rows, fewer than a window of {length}.")
         first = self.added - len(self) + rng.integers(len(self) - length + 1, size=batch)

@@ -16,9 +16,8 @@ def lambda_return(
         R_H = V(s_H);   R_k = r(s_{k+1}) + γ c_{k+1} [ (1 − λ) V(s_{k+1}) + λ R_{k+1} ]
 
     Args:
-        reward: (H, N) r(s_1) … r(s_H), the reward for arriving in each state.
-        continues: (H, N) c = 1 − d, the probability that the episode goes on in s_1 … s_H.
-        value: (H, N) V(s_1) … V(s_H).
+        reward, continues, value: (H, N) r, c = 1 − d and V of s_1 … s_H: the reward for arriving,
+            the probability that the episode goes on, the value.
         gamma: discount γ of one decision.
         lam: λ; 0 gives the one-step target, 1 the discounted rewards with V(s_H) at their end.
 
@@ -28,11 +27,8 @@ def lambda_return(
     Departure from print: the weights of the unnumbered definition above Eq. (5) sum to
     1 + λ^T (1 − λ). Eq. (5) is right; this is Eq. (5) as a recursion, with c in the place of 1.
     """
-    assert reward.shape == continues.shape == value.shape, (
-        reward.shape,
-        continues.shape,
-        value.shape,
-    )
+    shapes = {x.shape for x in (reward, continues, value)}
+    assert len(shapes) == 1, shapes
     one_step = reward + gamma * continues * (1 - lam) * value
     carry = gamma * lam * continues
     returns, following = [], value[-1]
@@ -47,11 +43,7 @@ def survival(continues: Tensor) -> Tensor:
 
         S_0 = 1;   S_k = c_1 c_2 … c_k
 
-    Args:
-        continues: (H, N) c in s_1 … s_H.
-
-    Returns:
-        (H, N) S_0 … S_{H−1}, the weights of the states that actions were taken in.
+    (H, N) c in s_1 … s_H -> (H, N) S_0 … S_{H−1}, the weights of the states that were acted in.
     """
     continues = continues.detach()  # a policy must not earn by making its own states count less
     return torch.cat([torch.ones_like(continues[:1]), continues[:-1].cumprod(0)])

@@ -260,12 +260,8 @@ def train(run: "Run", stop: Callable[[], bool]) -> None:
     """The algorithm: learn, evaluate, act, until all steps are made or `stop` says so.
 
     What is due follows from what was done, so that a run goes on from any checkpoint as if it had
-    never stopped.
-
-    Raises:
-        FloatingPointError: if a loss or gradient is not finite.
-        EnvironmentFault: if the environment fails.
-        OSError: if the disk is full.
+    never stopped. Raises a FloatingPointError if a loss or gradient is not finite, an
+    EnvironmentFault if the environment fails, an OSError if the disk is full.
     """
     s, agent, env, replay = run.s, run.agent, run.env, run.replay
     while not stop():
@@ -319,8 +315,8 @@ def beta_at(step: int, s: Settings) -> float:
 
 
 def evaluate(agent: "Agent", env, s: Settings, show=lambda text: None) -> list[Episode]:
-    """What episodes of the evaluated actor's mode earned and how long they were; each has a seed of
-    its own, always the same ones. One in which the environment fails is left out."""
+    """Totals and lengths of episodes of the evaluated actor's mode, each with a seed of its own,
+    always the same ones. One in which the environment fails is left out."""
     episodes = []
     for k in range(s.eval_episodes):
         show(f"evaluating, episode {k + 1} of {s.eval_episodes}")
@@ -342,14 +338,7 @@ def interval95(returns: np.ndarray) -> float:
 
 
 class Agent(nn.Module):
-    """All networks of a run, and one Adam for each that learns.
-
-    Args:
-        s: the settings.
-        actions: A.
-        device: where it lives.
-        bfloat16: whether `autocast` runs forward passes in bfloat16.
-    """
+    """All networks of a run with A actions, and one Adam for each that learns."""
 
     def __init__(self, s: Settings, actions: int, device: torch.device, bfloat16: bool):
         super().__init__()
@@ -368,11 +357,10 @@ class Agent(nn.Module):
         self.critics = nn.ModuleDict()
         learners = {"model": (self.model, s.model_lr)}
         for name, actor in self.actors.items():
-            critic = (
-                actors.QCritic(size, actions, s.units)
-                if s.q_critic
-                else actors.VCritic(size, s.units)
-            )
+            if s.q_critic:
+                critic = actors.QCritic(size, actions, s.units)
+            else:
+                critic = actors.VCritic(size, s.units)
             self.critics[name] = critic
             learners[f"{name}_actor"] = actor, s.actor_lr
             learners[f"{name}_critic"] = critic, s.critic_lr
@@ -405,23 +393,14 @@ class Agent(nn.Module):
         of_return, of_entropy = self.gradient_norms
         return of_return / of_entropy.clamp(min=1e-9) if self.s.beta_share else 1.0
 
-    @property
-    def precision(self) -> str:
-        """Of forward passes."""
-        return "bfloat16" if self.bfloat16 else "float32"
-
     def autocast(self) -> torch.autocast:
         """Matrix products and convolutions in bfloat16. A context holds the weights it has cast,
         so each forward pass between two optimiser steps has its own."""
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16)
 
     def step(self, name: str, loss: Tensor, metrics: dict[str, Tensor]) -> None:
-        """One step of the named optimiser on `loss`; its gradient norm goes into `metrics`.
-
-        Raises:
-            FloatingPointError: if loss or gradient is not finite, naming which of `metrics` is
-                not; the network is then as it was.
-        """
+        """One step of the named optimiser on `loss`; its gradient norm goes into `metrics`. A
+        FloatingPointError names which of them is not finite; the network is then as it was."""
         optimiser = self.optimisers[name]
         parameters = optimiser.param_groups[0]["params"]
         optimiser.zero_grad()
@@ -445,15 +424,13 @@ class Run:
 
     KEPT = (
         "step", "updates", "episode", "length", "over", "state", "actions", "visited", "averages",
-        "evaluated_at", "best", "seconds", "saved_rows", "metrics_bytes", "machine",
+        "rows", "evaluated_at", "best", "seconds", "saved_rows", "machine",
     )  # fmt: skip
 
     def __init__(self, s: Settings, folder: Path, device: str = "auto", precision: str = "auto"):
         self.s, self.folder = s, folder
-        self.env, self.eval_env = (
-            make_env(s.env, s.action_repeat, s.camera_distance, s.floor_brightness)
-            for _ in range(2)
-        )
+        view = s.camera_distance, s.floor_brightness
+        self.env, self.eval_env = (make_env(s.env, s.action_repeat, *view) for _ in range(2))
         torch.manual_seed(s.seed)
         self.rng = np.random.default_rng(s.seed)
         self.agent = make_agent(s, self.env, device, precision)
@@ -463,22 +440,20 @@ class Run:
         self.actions: list[list[float]] = []  # of the episode under way
         self.visited: list[list[float]] = []  # the environment's own, since the last evaluation
         self.averages: dict[str, list[float]] = {}  # name: [sum, count] since then
+        self.rows: list[dict[str, str]] = []  # of metrics.csv
         self.evaluated_at, self.best = 0, -float("inf")  # step of the last one; best mean return
-        self.saved_rows = self.metrics_bytes = 0  # of replay.bin and metrics.csv, when last saved
-        self.seconds, self.clock = 0.0, time.monotonic()  # taken until then; then
-        self.machine = f"{self.agent.device}, {self.agent.precision}, "
-        self.machine += f"{torch.get_num_threads()} threads, torch {torch.__version__}"
+        self.seconds, self.clock = 0.0, time.monotonic()  # taken until the last checkpoint; then
+        self.saved_rows = 0  # of the replay, then
+        precision = "bfloat16" if self.agent.bfloat16 else "float32"
+        self.machine = f"{self.agent.device}, {precision}, {torch.get_num_threads()} threads, "
+        self.machine += f"torch {torch.__version__}"
         self.bar = self.writer = None  # open while `train` runs
 
     def open(self) -> None:
-        """Take the folder for this process alone, and its replay.
-
-        Raises:
-            ValueError: in one sentence, if another process has it.
-        """
-        self.lock, owner = filelock.FileLock(self.folder / "run.lock"), self.folder / "run.owner"
+        """Take the folder, and its replay, for this process alone; a ValueError if another has."""
+        owner = self.folder / "run.owner"
         try:
-            self.lock.acquire(blocking=False)
+            self.lock = filelock.FileLock(self.folder / "run.lock").acquire(blocking=False)
         except filelock.Timeout:
             who = f"process {owner.read_text()}" if owner.exists() else "another process"
             raise ValueError(f"{self.folder} is in use by {who}: stop it or wait for it.") from None
@@ -487,28 +462,20 @@ class Run:
         actions, file = self.env.action_space.shape[0], self.folder / "replay.bin"
         self.replay = Replay(capacity, actions, file, reserve=3 * self.unsaved)
 
-    def describe(self) -> str:
-        """What runs where, for the terminal."""
-        s, row = self.s, self.replay.rows.itemsize
-        millions = sum(p.numel() for p in self.agent.parameters() if p.requires_grad) / 1e6
-        rows = min(s.replay_capacity, s.steps // s.action_repeat)
-        return (
-            f"{s.env}, arm {s.arm}, preset {s.preset}, seed {s.seed}, from step {self.step:,}: "
-            f"{self.folder}\n"
-            f"{millions:.1f} M parameters; {self.machine}; the replay will take "
-            f"{rows * row / 1e9:.1f} GB of disk"
-        )
-
     def sign(self) -> None:
         """Say in the folder what its experiment is, and which process goes on with it."""
         write_whole(self.folder / "run.owner", f"{os.getpid()} on {socket.gethostname()}".encode())
         write_whole(self.folder / "settings.json", self.s.to_json().encode())
 
     def begin_episode(self) -> np.ndarray:
-        """Reset to the next episode, with a seed of its own: its first image."""
-        seed = np.random.SeedSequence((self.s.seed, self.episode)).generate_state(1)[0] % 2**31
-        self.episode, self.over, self.length = self.episode + 1, False, 0
-        self.state, self.actions = None, []
+        """Go on to the next episode: its first image."""
+        self.episode += 1
+        self.over, self.length, self.state, self.actions = False, 0, None, []
+        return self.reset()
+
+    def reset(self) -> np.ndarray:
+        """The first image of the present episode, whose seed is its own."""
+        seed = np.random.SeedSequence((self.s.seed, self.episode - 1)).generate_state(1)[0] % 2**31
         return self.env.reset(seed=int(seed))[0]
 
     def note_decision(self, action: np.ndarray, over: bool, info: dict) -> None:
@@ -524,11 +491,11 @@ class Run:
 
     def note_update(self, metrics: dict[str, float]) -> None:
         """Count an update that was made; every fiftieth goes to TensorBoard as it is."""
-        self.updates += 1
-        self.average(metrics)
-        if self.updates % 50 == 1:
+        if self.updates % 50 == 0:
             for name, value in metrics.items():
                 self.writer.add_scalar(f"update/{name}", value, self.step)
+        self.updates += 1
+        self.average(metrics)
 
     def average(self, metrics: dict[str, float]) -> None:
         """Take metrics into the averages of the next row of metrics.csv."""
@@ -549,36 +516,28 @@ class Run:
             return
         returns, lengths = np.array([(e.total, e.length) for e in episodes]).T
         row = {
-            "env_steps": self.step,
-            "wall_seconds": self.elapsed(),
-            "eval_return": returns.mean(),
-            "eval_interval95": interval95(returns),
-            "eval_length": lengths.mean(),
-            "eval_length_min": lengths.min(),
-            "eval_length_max": lengths.max(),
-            "coverage": coverage(np.array(self.visited)),
-            "train_return": float("nan"),  # unless an episode ended
-            "train_length": float("nan"),
-        } | {name: total / count for name, (total, count) in self.averages.items()}
+            "env_steps": self.step, "wall_seconds": self.elapsed(),
+            "eval_return": returns.mean(), "eval_interval95": interval95(returns),
+            "eval_length": lengths.mean(), "eval_length_min": lengths.min(),
+            "eval_length_max": lengths.max(), "coverage": coverage(np.array(self.visited)),
+            "train_return": float("nan"), "train_length": float("nan"),  # unless an episode ended
+        } | {name: total / count for name, (total, count) in self.averages.items()}  # fmt: skip
         self.averages, self.visited = {}, []
-        with open(self.folder / "metrics.csv", "a+", newline="", errors="replace") as file:
-            file.seek(0)
-            header = file.readline().strip().split(",")  # a resumed run keeps its columns
-            known = "env_steps" in header
-            table = csv.DictWriter(file, header if known else row, "nan", "ignore")
-            file.seek(0, os.SEEK_END)
-            if not known:
-                table.writeheader()
-            table.writerow({k: v if isinstance(v, int) else f"{v:.6g}" for k, v in row.items()})
-            self.metrics_bytes = file.tell()
+        self.rows.append({k: str(v) if k == "env_steps" else f"{v:.6g}" for k, v in row.items()})
+        table = io.StringIO()
+        writer = csv.DictWriter(table, dict.fromkeys(k for row in self.rows for k in row), "nan")
+        writer.writeheader()
+        writer.writerows(self.rows)
+        write_whole(self.folder / "metrics.csv", table.getvalue().encode())
         for name, value in row.items():
             self.writer.add_scalar(name, value, self.step)
         self.writer.flush()
         spread = f" ± {interval95(returns):.1f}" if len(returns) > 1 else ""
-        self.bar.set_postfix_str(f"return {returns.mean():.1f}{spread}")
+        said = f"return {returns.mean():.1f}{spread}"
+        self.bar.set_postfix_str(said)
         self.bar.write(
-            f"{self.step:9,} environment steps, {self.elapsed() / 60:5.1f} min: "
-            f"return {returns.mean():.1f}{spread}, {lengths.mean():.0f} steps an episode"
+            f"{self.step:9,} environment steps, {self.elapsed() / 60:5.1f} min: {said}, "
+            f"{lengths.mean():.0f} steps an episode"
         )
         if returns.mean() >= self.best:
             self.best = float(returns.mean())
@@ -595,11 +554,7 @@ class Run:
             self.save()
 
     def save(self) -> None:
-        """Write a checkpoint, whole or not at all; the one before it is kept.
-
-        Raises:
-            OSError: if it cannot be written, as on a full disk; the last one is then as it was.
-        """
+        """Write a checkpoint, whole or not at all (an OSError); the one before it is kept."""
         self.seconds, self.clock = self.elapsed(), time.monotonic()
         self.saved_rows = self.replay.added
         newest, previous = (self.folder / name for name in CHECKPOINTS)
@@ -615,71 +570,56 @@ class Run:
         }
         write_whole(newest, content, keep=previous)
 
-    def load(self) -> dict:
-        """Go back to the newest whole checkpoint. Returns the settings with which it was made.
-
-        Raises:
-            ValueError: in one sentence, if there is none, or the replay is not its own.
-        """
+    def load(self) -> None:
+        """Go back to the newest whole checkpoint, and say what is not as it was. A ValueError if
+        there is none, the replay is not its own, or what may not change differs."""
         path, saved = read_checkpoint(self.folder)
-        made, now = json.loads(saved["settings"]), dataclasses.asdict(self.s)
-        if edited := [k for k in now if k not in CHANGEABLE and now[k] != made.get(k)]:
-            raise ValueError(
-                f"{self.folder} was made with other settings than its settings.json says: "
-                f"{', '.join(f'{k} {made.get(k)}' for k in edited)}; put them back."
-            )
-        machine = self.machine
-        for name in self.KEPT:
-            setattr(self, name, saved["kept"][name])
+        made, now, here = json.loads(saved["settings"]), dataclasses.asdict(self.s), self.machine
+        changed = [name for name in now if now[name] != made.get(name)]
+        if fixed := [f"{name} {made.get(name)}" for name in changed if name not in CHANGEABLE]:
+            raise ValueError(f"{self.folder} keeps its own {', '.join(fixed)}; {RESUME_TAKES}.")
+        vars(self).update(saved["kept"])
         self.replay.restore(self.saved_rows, saved["checksums"].numpy())
         load_networks(self.agent, saved["agent"])
         for name, optimiser in self.agent.optimisers.items():
-            rate = optimiser.param_groups[0]["lr"]
-            optimiser.load_state_dict(saved["optimisers"][name])
-            optimiser.param_groups[0]["lr"] = rate  # the settings', which may have changed since
-        self.state = self.state if self.state is None else self.state.to(self.agent.device)
+            now_set = optimiser.state_dict()["param_groups"]  # the rate may have changed since
+            optimiser.load_state_dict(saved["optimisers"][name] | {"param_groups": now_set})
+        self.state = None if self.state is None else self.state.to(self.agent.device)
         self.rng.bit_generator.state = json.loads(saved["numpy_random"])
-        if machine != self.machine:
-            say(f"Begun on {self.machine}, it goes on on {machine}: otherwise than it would have.")
-            self.machine = machine
+        if here != self.machine:
+            say(f"Begun on {self.machine}, it goes on on {here}: otherwise than it would have.")
+            self.machine = here
         damaged = self.folder / CHECKPOINTS[0]
         if path != damaged and damaged.exists():  # it must not take the place of this
             damaged.replace(damaged.with_suffix(".damaged"))
-        with open(self.folder / "metrics.csv", "a+b") as file:
-            file.seek(0)
-            whole = file.read(self.metrics_bytes)  # without rows that are younger
-            if len(whole) < self.metrics_bytes:
-                say(f"{file.name} has lost rows since the checkpoint: it goes on without them.")
-            self.metrics_bytes = whole.rfind(b"\n") + 1
-            file.truncate(self.metrics_bytes)
-        self.retrace()
+        if not self.over:
+            self.retrace()
         torch.set_rng_state(saved["torch_random"])
-        if self.agent.device.type == "cuda" and saved["cuda_random"]:
+        if self.agent.device.type == "cuda":
             torch.cuda.set_rng_state_all(saved["cuda_random"])
-        return made
+        for name in changed:
+            since = f"{name}: {now[name]} in the place of {made[name]} from step {self.step:,} on"
+            say(since + ("; β now falls to its end by then." if name == "steps" else "."))
 
     def retrace(self) -> None:
         """Take the actions of the episode under way again: its environment is then where it was."""
-        if self.over:
-            return
-        actions, state, length = self.actions, self.state, self.length
-        self.episode -= 1
-        try:
-            image = self.begin_episode()
-            for action in actions:
+        with contextlib.suppress(EnvironmentFault):
+            image = self.reset()
+            for action in self.actions:
                 image = self.env.step(np.float32(action))[0]
-        except EnvironmentFault:
-            image = None
-        self.actions, self.state, self.length = actions, state, length
-        self.over = not np.array_equal(image, self.replay.last["image"])
-        if self.over:
-            say(
-                f"{self.s.env} does not repeat itself: the episode under way ends here, and the "
-                "run goes on otherwise than it would have."
-            )
+            if np.array_equal(image, self.replay.last["image"]):
+                return
+        self.over = True
+        say(f"{self.s.env} does not repeat itself: the episode under way ends here, and the run "
+            "goes on otherwise than it would have.")  # fmt: skip
 
 
 CHECKPOINTS = ("checkpoint.pt", "checkpoint.previous.pt")
+CHANGEABLE = (
+    "steps", "eval_every", "eval_episodes", "eval_max_steps", "checkpoint_minutes", "model_lr",
+    "actor_lr", "critic_lr", "mdn_lr", "grad_clip",
+)  # fmt: skip
+RESUME_TAKES = f"--resume takes {', '.join(CHANGEABLE)}"
 
 
 def write_whole(path: Path, content: object, keep: Path | None = None) -> None:
@@ -696,11 +636,8 @@ def write_whole(path: Path, content: object, keep: Path | None = None) -> None:
 
 
 def read_checkpoint(folder: Path) -> tuple[Path, dict]:
-    """The newest whole checkpoint and its path. Nothing in it is executed.
-
-    Raises:
-        ValueError: in one sentence, if none is whole.
-    """
+    """The newest whole checkpoint and its path; a ValueError if none is whole. Nothing in it is
+    executed."""
     for path in (folder / name for name in CHECKPOINTS):
         if path.exists():
             with contextlib.suppress(Exception), zipfile.ZipFile(path) as file:  # damage has many
@@ -713,15 +650,11 @@ def read_checkpoint(folder: Path) -> tuple[Path, dict]:
 
 
 def make_agent(s: Settings, env, device: str = "auto", precision: str = "auto") -> Agent:
-    """An untrained agent on this machine.
-
-    Raises:
-        ValueError: in one sentence, if the device is not there or no memory holds the networks.
-    """
+    """An untrained agent; a ValueError if the device is not there or no memory holds it."""
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ValueError("--device cuda: no CUDA device is here; leave it out to use the CPU.")
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
-    elif device == "cuda" and not torch.cuda.is_available():
-        raise ValueError("--device cuda: no CUDA device is here; leave it out to use the CPU.")
     device = torch.device(device)
     bfloat16 = has_bfloat16(device) if precision == "auto" else precision == "bfloat16"
     try:
@@ -731,11 +664,11 @@ def make_agent(s: Settings, env, device: str = "auto", precision: str = "auto") 
 
 
 def load_networks(agent: Agent, weights: dict[str, Tensor]) -> None:
-    """Put saved weights into an agent. A ValueError, in one sentence, if they are of another."""
+    """Put saved weights into an agent; a ValueError if they are of another."""
     try:
         agent.load_state_dict(weights)
     except RuntimeError as error:
-        raise ValueError(f"Other networks were saved: {' '.join(str(error).split())}") from None
+        raise ValueError(f"Other networks were saved: {error}") from None
 
 
 def has_bfloat16(device: torch.device) -> bool:
@@ -762,120 +695,86 @@ class Command:
 
 def parse(arguments: list[str]) -> Command:
     """The command line. The arm and preset, or the run to go on with, set the defaults that the
-    other options change.
+    other options change. A ValueError says what cannot be understood."""
+    known = understood([a for a in arguments if a not in ("-h", "--help")], Settings())
+    if known.resume is not None:
+        return understood(arguments, read_settings(folder_named(known.resume)))
+    return understood(arguments, default_settings(known.settings.arm, known.settings.preset))
 
-    Raises:
-        ValueError: in one sentence, what cannot be understood.
-    """
 
-    def parsed(settings: Settings, arguments: list[str]) -> Command:
-        try:
-            with contextlib.redirect_stderr(io.StringIO()) as said:
-                return tyro.cli(Command, prog="train.py", args=arguments, default=Command(settings))
-        except SystemExit as error:
-            if not error.code:  # --help
-                raise
-            lines = said.getvalue().splitlines()[1:]  # of a box, below its title
-            raise ValueError(
-                " ".join(re.sub("[─│╭╮╰╯]|-{3,}", " ", " ".join(lines)).split())
-            ) from None
-
-    first = parsed(Settings(), [a for a in arguments if a not in ("-h", "--help")])
-    if first.resume is not None:
-        return parsed(read_settings(folder_named(first.resume)), arguments)
-    return parsed(default_settings(first.settings.arm, first.settings.preset), arguments)
+def understood(arguments: list[str], default: Settings) -> Command:
+    """The command line over these defaults."""
+    try:
+        with contextlib.redirect_stderr(io.StringIO()) as said:
+            return tyro.cli(Command, prog="train.py", args=arguments, default=Command(default))
+    except SystemExit as error:
+        if not error.code:  # --help
+            raise
+        below_title = said.getvalue().partition("\n")[2]
+        words = re.sub("[─│╭╮╰╯]|-{3,}", " ", below_title).split()  # without the box around them
+        raise ValueError(" ".join(words)) from None
 
 
 def check(text: str, where: str = "") -> Settings:
-    """The settings that a JSON text holds.
-
-    Raises:
-        ValueError: in one sentence, which of them cannot be, and why.
-    """
+    """The settings of a JSON text. A ValueError says which of them cannot be, and why."""
     try:
         s = TypeAdapter(Settings).validate_json(text, strict=True)
     except ValidationError as error:
         wrong = error.errors()[0]
-        option = "".join(f"--{name}" for name in wrong["loc"]).replace("_", "-")
-        what = f"{option} is {wrong['input']}: {wrong['msg']}" if option else wrong["msg"]
-        raise ValueError(f"{where}{what}.") from None
+        for name in wrong["loc"]:  # none, if it is no JSON
+            where += f"--{name.replace('_', '-')} is {wrong['input']}: "
+        raise ValueError(f"{where}{wrong['msg']}.") from None
     rows, least = s.prefill // s.action_repeat, s.prefill + s.train_every
-    for impossible, sentence in (
-        (s.length > rows, f"--length {s.length} is longer than the {rows} rows that --prefill "
-         f"{s.prefill} collects: lower the one or raise the other."),
-        (s.length > s.replay_capacity, f"--replay-capacity {s.replay_capacity} holds no --length "
-         f"{s.length}: raise the one or lower the other."),
-        (s.steps < least, f"--steps {s.steps} leaves nothing to train after --prefill {s.prefill}: "
-         f"raise it to {least} or more."),
-        (s.eval_every < s.train_every, f"--eval-every {s.eval_every} is less than --train-every "
-         f"{s.train_every}: raise it to that."),
-    ):  # fmt: skip
-        if impossible:
-            raise ValueError(f"{where}{sentence}")
+    for possible, sentence in (
+        (s.length <= rows, f"--prefill {s.prefill} makes {rows} rows, no --length {s.length}"),
+        (s.length <= s.replay_capacity, f"--replay-capacity is less than --length {s.length}"),
+        (s.steps >= least, f"--steps {s.steps} leaves no update after --prefill: give {least}"),
+        (s.eval_every >= s.train_every, f"--eval-every is less than --train-every {s.train_every}"),
+    ):
+        if not possible:
+            raise ValueError(f"{where}{sentence}.")
     return s
 
 
 def read_settings(folder: Path) -> Settings:
-    """The settings of a run folder.
-
-    Raises:
-        ValueError: in one sentence, if it holds none, or those of another version of this program.
-    """
+    """The settings of a run's folder. An OSError if it holds none, a ValueError if
+    they are another version's or cannot be."""
     path = folder / "settings.json"
-    if not path.is_file():
-        raise ValueError(f"{folder} holds no run: there is no settings.json in it.")
     text = path.read_text("utf-8-sig", "replace")
-    try:
-        saved = dict(json.loads(text))
-    except (ValueError, TypeError, RecursionError) as error:
-        raise ValueError(f"{path} cannot be read: {error}.") from None
-    if differing := saved.keys() ^ {field.name for field in dataclasses.fields(Settings)}:
+    s = check(text, f"{path}: ")
+    if differing := json.loads(text).keys() ^ dataclasses.asdict(s).keys():
         names = ", ".join(sorted(differing))
         raise ValueError(f"{folder} was made by a version with other settings: {names}.")
-    return check(text, f"{path}: ")
+    return s
 
 
 def folder_named(text: str) -> Path:
-    """The folder that a user names, wherever the environment goes.
-
-    Raises:
-        ValueError: in one sentence, if its name is not UTF-8, as TensorBoard's files want it.
-    """
+    """The folder that a user names, wherever the environment goes."""
     path = os.path.abspath(os.path.expanduser(text))
-    if path != path.encode(errors="ignore").decode():
+    if path != path.encode(errors="ignore").decode():  # TensorBoard could not write to it
         raise ValueError(f"{path!a} is not UTF-8: name another folder.")
     return Path(path)
 
 
 def new_run(command: Command) -> Run:
-    """A new run in a folder of its own, made once all else is known to work.
-
-    Raises:
-        ValueError: in one sentence, what is wrong with the command.
-    """
+    """A new run in a folder of its own, made once all else is known to work. A ValueError says
+    what is wrong with the command."""
     s = check(command.settings.to_json())
     name = f"{s.env}-{s.arm}-{s.preset}-seed{s.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
     folder = folder_named(command.run_dir or "runs/" + re.sub(r"[^\w.-]", "-", name))
     taken = f"{folder} is there already: name another --run-dir, or --resume it."
-    if command.run_dir and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    if command.run_dir and folder.exists() and any(folder.iterdir()):
         raise ValueError(taken)
     run = Run(s, folder, command.device, command.precision)
-    while True:
-        try:
-            run.folder.mkdir(parents=True, exist_ok=bool(command.run_dir))
-            break
-        except FileExistsError:  # begun in the same second
-            if command.run_dir:
-                raise
-            run.folder = run.folder.with_name(run.folder.name + "+")
+    while run.folder.exists() and not command.run_dir:  # begun in the same second
+        run.folder = run.folder.with_name(run.folder.name + "+")
+    run.folder.mkdir(parents=True, exist_ok=True)
+    run.open()
+    if (run.folder / "settings.json").exists():  # of a process that was faster, and is done
+        raise ValueError(taken)
     try:
-        run.open()
-        if (run.folder / "settings.json").exists():  # of a process that was faster, and is done
-            raise ValueError(taken)
         run.save()
         run.sign()
-    except ValueError:  # the folder is another's
-        raise
     except BaseException:
         shutil.rmtree(run.folder, ignore_errors=True)
         raise
@@ -883,31 +782,16 @@ def new_run(command: Command) -> Run:
 
 
 def resumed_run(command: Command) -> Run:
-    """The run of a folder, from its newest checkpoint, with the settings that changed.
-
-    Raises:
-        ValueError: in one sentence, why it cannot go on, or not with these settings.
-    """
-    folder = folder_named(command.resume)
-    before, after = (dataclasses.asdict(x) for x in (read_settings(folder), command.settings))
-    fixed = [name for name in after if after[name] != before[name] and name not in CHANGEABLE]
-    if command.run_dir or fixed:
-        fixed = ", ".join(fixed) or "run_dir"
-        raise ValueError(f"--resume keeps the run's own {fixed}; it takes {', '.join(CHANGEABLE)}.")
-    run = Run(check(command.settings.to_json()), folder, command.device, command.precision)
+    """The run of a folder, from its newest checkpoint, with the settings that changed. A ValueError
+    says why it cannot go on, or not with these."""
+    if command.run_dir:
+        raise ValueError(f"--resume keeps the run's own run_dir; {RESUME_TAKES}.")
+    s, folder = check(command.settings.to_json()), folder_named(command.resume)
+    run = Run(s, folder, command.device, command.precision)
     run.open()
-    before = run.load()  # settings.json may have been edited
-    for name in (name for name in CHANGEABLE if after[name] != before[name]):
-        say(f"{name}: {after[name]} in the place of {before[name]} from step {run.step:,} on"
-            + ("; β now falls to its end by then." if name == "steps" else "."))  # fmt: skip
+    run.load()
     run.sign()
     return run
-
-
-CHANGEABLE = (
-    "steps", "eval_every", "eval_episodes", "eval_max_steps", "checkpoint_minutes", "model_lr",
-    "actor_lr", "critic_lr", "mdn_lr", "grad_clip",
-)  # fmt: skip
 
 
 def main(arguments: list[str]) -> int:
@@ -924,56 +808,61 @@ def main(arguments: list[str]) -> int:
     except (ValueError, OSError, MemoryError) as error:
         say(error)
         return 2
-    try:
+    with run.lock:
         return train_run(run)
-    finally:
-        run.lock.release()
 
 
 def train_run(run: Run) -> int:
     """Trains to the end, to a signal or to a fault, and says what to do next: the exit code."""
-    stopped = threading.Event()
+    s, stopped = run.s, threading.Event()
 
     def stop(number: int, _) -> None:
         run.bar.write("Finishing what is under way, then saving; Ctrl-C again to stop at once.")
         stopped.set()
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    print(run.describe(), flush=True)
+    size = sum(p.numel() for p in run.agent.parameters() if p.requires_grad) / 1e6
+    disk = min(s.replay_capacity, s.steps // s.action_repeat) * run.replay.dtype.itemsize / 1e9
+    print(f"{s.env}, arm {s.arm}, preset {s.preset}, seed {s.seed}, from step {run.step:,}: "
+          f"{run.folder}\n{size:.1f} M parameters; {run.machine}; the replay will take "
+          f"{disk:.1f} GB of disk", flush=True)  # fmt: skip
     resume = "Go on with: " + shlex.join([sys.executable, __file__, "--resume", str(run.folder)])
     every = 0.5 if sys.stderr.isatty() else 30  # seconds between two lines of a log file
     try:
         with (
-            tqdm(total=run.s.steps, initial=run.step, unit="step", mininterval=every) as run.bar,
+            tqdm(total=s.steps, initial=run.step, unit="step", mininterval=every) as run.bar,
             SummaryWriter(run.folder, purge_step=run.step + 1) as run.writer,
         ):
-            hangup = getattr(signal, "SIGHUP", signal.SIGINT)  # Windows has none
-            for number in (signal.SIGINT, signal.SIGTERM, hangup):
-                if number != hangup or signal.getsignal(number) != signal.SIG_IGN:  # nohup
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
                     signal.signal(number, stop)
             train(run, stopped.is_set)
-    except FloatingPointError as error:
-        say(f"{error} The last checkpoint is from before: go on from it with a lower --model-lr, "
-            f"--actor-lr or --critic-lr, or with --precision float32. {resume}")  # fmt: skip
-    except EnvironmentFault as error:
+    except (RuntimeError, ArithmeticError, MemoryError, OSError) as error:
+        say(f"{explained(error, run)} {resume}")
+        return 1
+    done = run.step >= s.steps and not stopped.is_set()
+    print(f"Done: {run.folder / 'metrics.csv'}" if done else f"Stopped. {resume}", flush=True)
+    return 0
+
+
+def explained(error: Exception, run: Run) -> str:
+    """What stopped a run, for its user. What can only be a fault of this program is raised."""
+    reason = str(error).partition("\n")[0]  # a MemoryError may have none
+    if isinstance(error, FloatingPointError):
+        return (f"{error} The last checkpoint is from before: go on with a lower --model-lr, "
+                "--actor-lr or --critic-lr, or with --precision float32.")  # fmt: skip
+    if isinstance(error, EnvironmentFault):
         run.over = True  # whoever goes on begins another episode
         with contextlib.suppress(OSError):
             run.save()
-            error = f"{error} What was learnt is saved."
-        say(f"{error} {resume}")
-    except (MemoryError, RuntimeError) as error:
-        if "alloc" not in str(error) and not isinstance(error, MemoryError):
-            raise
+            return f"{error} What was learnt is saved."
+        return str(error)
+    if isinstance(error, OSError):
+        return f"{error}: stopped; what was saved before is whole."
+    if isinstance(error, MemoryError) or "alloc" in str(error):
         size = f"--batch-size {run.s.batch_size} and --length {run.s.length}"
-        reason = str(error).partition("\n")[0]  # a MemoryError may have none
-        say(f"No memory for an update of {size}: {reason} {resume}")
-    except OSError as error:
-        say(f"{error}: stopped; what was saved before is whole. {resume}")
-    else:
-        done = run.step >= run.s.steps and not stopped.is_set()
-        print(f"Done: {run.folder / 'metrics.csv'}" if done else f"Stopped. {resume}", flush=True)
-        return 0
-    return 1
+        return f"No memory for an update of {size}: {reason}"
+    raise error
 
 
 def say(text: object) -> None:
@@ -1003,8 +892,7 @@ class Patient:
 
     def __init__(self, stream):
         self.stream = stream or open(os.devnull, "w")  # None: it was closed from the start
-        with contextlib.suppress(AttributeError):
-            stream.reconfigure(errors="replace")
+        self.stream.reconfigure(errors="replace")
 
     def write(self, text: str) -> int:
         with contextlib.suppress(OSError, ValueError):

@@ -75,9 +75,8 @@ class TransposedConvolution(torch.autograd.Function):
     """A transposed convolution of stride 2, each direction in the form that a CPU is fast in.
 
     Forwards, output pixels of one parity in rows and columns are a plain convolution of half the
-    kernel: all four at once, then interleaved. Backwards, its transpose is a plain convolution, and
-    the bias's gradient is a sum. The decoder's three take 78 ms for 250 images of depth 16 on one
-    thread, in PyTorch's own form 149 (depth 32: 205 and 356).
+    kernel: all four at once, then interleaved. Backwards, its transpose is a plain convolution. The
+    decoder's three take 78 ms for 250 images of depth 16 on one thread, in PyTorch's own form 149.
     """
 
     @staticmethod
@@ -117,11 +116,7 @@ class TransposedConv2d(nn.ConvTranspose2d):
 
 class Decoder(nn.Module):
     """States to images: a linear layer, then transposed convolutions of kernels 5, 5, 6, 6, stride
-    2 and ReLU.
-
-    The first transposed convolution acts on a 1×1 map, where it is a linear layer, and is written
-    as one.
-    """
+    2 and ReLU. The first acts on a 1×1 map, where it is a linear layer, and is written as one."""
 
     def __init__(self, inputs: int, depth: int):
         super().__init__()
@@ -143,10 +138,8 @@ class Decoder(nn.Module):
         return self.net(maps).permute(0, 2, 3, 1).float()
 
     def nll(self, x: Tensor, image: Tensor) -> Tensor:
-        """½ Σ (o − o')² over pixels, which is −log Normal(o; o', 1) but for a constant.
-
-        (M, inputs), (M, 64, 64, 3) uint8 -> (M,)
-        """
+        """½ Σ (o − o')² over pixels, which is −log Normal(o; o', 1) but for a constant:
+        (M, inputs), (M, 64, 64, 3) uint8 -> (M,)."""
 
         def part(x: Tensor, image: Tensor) -> Tensor:
             return 0.5 * (self(x) - centre(image)).square().flatten(1).sum(1)
@@ -200,21 +193,10 @@ class WorldModel(nn.Module):
     """
 
     def __init__(
-        self,
-        actions: int,
-        *,
-        deter: int,
-        stoch: int,
-        hidden: int,
-        units: int,
-        depth: int,
-        termination: bool,
-        fixed_prior: bool,
-        smooth_l1: bool,
-        decode_stoch_only: bool,
-        observe_first: bool,
-        free_nats: float,
-    ):
+        self, actions: int, *, deter: int, stoch: int, hidden: int, units: int, depth: int,
+        termination: bool, fixed_prior: bool, smooth_l1: bool, decode_stoch_only: bool,
+        observe_first: bool, free_nats: float,
+    ):  # fmt: skip
         super().__init__()
         self.deter, self.stoch, self.size = deter, stoch, deter + stoch
         self.fixed_prior, self.smooth_l1, self.free_nats = fixed_prior, smooth_l1, free_nats
