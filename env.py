@@ -317,10 +317,10 @@ class Replay:
         self.map_file()
 
     def map_file(self) -> None:
-        """Take the file's rows for the array."""
-        self.file = np.memmap(self.path, np.uint8, "r+")
-        whole = len(self.file) // self.dtype.itemsize
-        self.rows = np.asarray(self.file)[: whole * self.dtype.itemsize].view(self.dtype)
+        """Take the file's whole rows for the array."""
+        whole = self.path.stat().st_size // self.dtype.itemsize
+        self.file = np.memmap(self.path, self.dtype, "r+", shape=whole)
+        self.rows = np.asarray(self.file)
 
     def add(self, image, action=0.0, reward=0.0, terminated=False, is_first=False) -> None:
         """Append one row, of a reset without action and reward. An OSError if the disk is full."""
@@ -339,7 +339,7 @@ class Replay:
         return self.rows[(self.added - 1) % self.ring]
 
     def flush(self) -> np.ndarray:
-        """Bring the file onto the disk. Returns the checksums of the rows that can be sampled."""
+        """Bring the file onto the disk: the checksums of the rows that can be sampled."""
         if self.added:
             self.file.flush()
         return self.checksums[np.arange(self.added - len(self), self.added) % self.ring]

@@ -823,8 +823,8 @@ def train_run(run: Run) -> int:
 
     size = sum(p.numel() for p in run.agent.parameters() if p.requires_grad) / 1e6
     disk = min(s.replay_capacity, s.steps // s.action_repeat) * run.replay.dtype.itemsize / 1e9
-    print(f"{s.env}, arm {s.arm}, preset {s.preset}, seed {s.seed}, from step {run.step:,}: "
-          f"{run.folder}\n{size:.1f} M parameters; {run.machine}; the replay will take "
+    what = f"{s.env}, arm {s.arm}, preset {s.preset}, seed {s.seed}, from step {run.step:,}"
+    print(f"{what}: {run.folder}\n{size:.1f} M parameters; {run.machine}; the replay will take "
           f"{disk:.1f} GB of disk", flush=True)  # fmt: skip
     resume = "Go on with: " + shlex.join([sys.executable, __file__, "--resume", str(run.folder)])
     every = 0.5 if sys.stderr.isatty() else 30  # seconds between two lines of a log file
@@ -881,10 +881,8 @@ def keep_freed_memory() -> None:
     the system would clear each page anew (measured: a fifth of the paper preset's update)."""
     with contextlib.suppress(OSError, AttributeError, TypeError):  # another C library, or none
         trim_threshold, top_pad, mmap_max = -1, -2, -4  # malloc.h
-        libc = ctypes.CDLL(None)
-        libc.mallopt(mmap_max, 0)
-        libc.mallopt(trim_threshold, 2**31 - 1)
-        libc.mallopt(top_pad, 64 * 2**20)
+        for option, value in ((mmap_max, 0), (trim_threshold, 2**31 - 1), (top_pad, 64 * 2**20)):
+            ctypes.CDLL(None).mallopt(option, value)
 
 
 class Patient:
