@@ -6,6 +6,7 @@
 they call it. No other file reads settings, holds an optimiser or knows a run's folder.
 """
 
+import atexit
 import contextlib
 import csv
 import ctypes
@@ -23,14 +24,15 @@ import sys
 import threading
 import time
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import filelock
 import numpy as np
 import torch
+import torch.distributed as dist
 import tyro
 from annotated_types import Interval
 from pydantic import TypeAdapter, ValidationError
@@ -220,35 +222,37 @@ def update_actor(
             metrics["mdn/entropy"] = bonus
             terms["entropy"] = -bonus
         if look and explores:
-            measure_gradients(agent, actor, terms, beta, metrics)
+            measure_gradients(agent, actor, terms, beta, metrics, len(starts))
         loss = terms["return"] + s.action_penalty * actor.raw(starts).square().sum(-1).mean()
         if explores:
             loss = loss + beta * agent.entropy_scale * terms["entropy"]
     metrics[f"{name}_actor/return"] = returns[0].mean()
     metrics[f"{name}_actor/saturated"] = (dream.action.abs() > 0.99).float().mean()
     metrics[f"{name}_actor/deviation"] = actor.mode(starts).detach().std(0).mean()  # over states
-    agent.step(f"{name}_actor", loss, metrics)
+    agent.step(f"{name}_actor", loss, metrics, len(starts))
 
     with agent.autocast():
         loss = critic_loss(critic, dream, returns, s.smooth_l1)
     metrics[f"{name}_critic/loss"] = loss
-    agent.step(f"{name}_critic", loss, metrics)
+    agent.step(f"{name}_critic", loss, metrics, len(starts))
     if explores:
         with agent.autocast():
             loss = mdn_loss(agent.mdn, dream.state, dream.continues, s.gamma_q).mean()
         metrics["mdn/nll"] = loss
-        agent.step("mdn", loss, metrics)
+        agent.step("mdn", loss, metrics, len(starts))
         soft_update(agent.target_mdn, agent.mdn, s.target_rate)
 
 
 def measure_gradients(
-    agent: "Agent", actor: nn.Module, terms: dict[str, Tensor], beta: float, metrics: dict
-) -> None:
+    agent: "Agent", actor: nn.Module, terms: dict[str, Tensor], beta: float, metrics: dict,
+    count: int = 1,
+) -> None:  # fmt: skip
     """The norms of the gradients of both terms of Eq. (7) apart, and their averages: `beta_share`
     needs them, since the β of §5 is for one size of state and one robot's rewards."""
     norms = {}
     for name, term in terms.items():
         gradients = torch.autograd.grad(term, list(actor.parameters()), retain_graph=True)
+        average_over_processes(gradients, count)
         norms[name] = nn.utils.get_total_norm(gradients)
     average, now = agent.gradient_norms, torch.stack([norms["return"], norms["entropy"]])
     average.lerp_(now, 0.1 if average.any() else 1.0)
@@ -264,9 +268,9 @@ def train(run: "Run", stop: Callable[[], bool]) -> None:
     EnvironmentFault if the environment fails, an OSError if the disk is full.
     """
     s, agent, env, replay = run.s, run.agent, run.env, run.replay
-    while not stop():
+    while not any(gathered(stop())):
         if run.updates < updates_due(run.step, s):
-            rows = replay.sample(s.batch_size, s.length, run.rng)
+            rows = replay.sample(s.batch_size // processes(), s.length, run.rng)
             batch, beta = to_tensors(rows, agent.device), beta_at(run.step, s)
             began = time.monotonic()
             metrics = update(agent, batch, beta, s, look=run.updates % 50 == 0)
@@ -287,7 +291,8 @@ def train(run: "Run", stop: Callable[[], bool]) -> None:
             replay.add(image, action, reward, terminated)
             run.note_decision(action, terminated or truncated, info)
         else:
-            write_whole(run.folder / "weights.pt", agent.state_dict())
+            if rank() == 0:
+                write_whole(run.folder / "weights.pt", agent.state_dict())
             break
         run.save_if_due()
     run.save()
@@ -315,10 +320,10 @@ def beta_at(step: int, s: Settings) -> float:
 
 
 def evaluate(agent: "Agent", env, s: Settings, show=lambda text: None) -> list[Episode]:
-    """Totals and lengths of episodes of the evaluated actor's mode, each with a seed of its own,
-    always the same ones. One in which the environment fails is left out."""
+    """Totals and lengths of this process's share of episodes of the evaluated actor's mode, each
+    with a seed of its own, always the same. One in which the environment fails is left out."""
     episodes = []
-    for k in range(s.eval_episodes):
+    for k in range(rank(), s.eval_episodes, processes()):
         show(f"evaluating, episode {k + 1} of {s.eval_episodes}")
         seed = 2**31 - 1 - k  # some environments take none that is larger
         try:
@@ -398,13 +403,15 @@ class Agent(nn.Module):
         so each forward pass between two optimiser steps has its own."""
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16)
 
-    def step(self, name: str, loss: Tensor, metrics: dict[str, Tensor]) -> None:
-        """One step of the named optimiser on `loss`; its gradient norm goes into `metrics`. A
-        FloatingPointError names which of them is not finite; the network is then as it was."""
+    def step(self, name: str, loss: Tensor, metrics: dict[str, Tensor], count: int = 1) -> None:
+        """One step of the named optimiser on `loss`, a mean of so many; the gradient's norm goes
+        into `metrics`. A FloatingPointError names which is not finite; nothing is changed then."""
         optimiser = self.optimisers[name]
         parameters = optimiser.param_groups[0]["params"]
         optimiser.zero_grad()
         loss.backward(inputs=parameters)  # through other networks, but into no other's gradients
+        loss = loss.detach().clone()  # not finite in one process, it is so in all
+        average_over_processes([loss, *(p.grad for p in parameters)], count)
         norm = nn.utils.clip_grad_norm_(parameters, self.s.grad_clip)
         metrics[f"{name}/grad_norm"] = norm
         if not torch.isfinite(norm + loss):
@@ -414,12 +421,67 @@ class Agent(nn.Module):
         optimiser.step()
 
 
+def join_processes() -> None:
+    """Meet the processes that torchrun started beside this one, if it did: by gloo on a CPU, by
+    NCCL on CUDA, a device each. A ValueError if there are fewer devices."""
+    if not dist.is_torchelastic_launched() or dist.is_initialized():
+        return
+    devices, here = torch.cuda.device_count(), int(os.environ["LOCAL_WORLD_SIZE"])
+    if 0 < devices < here:
+        raise ValueError(f"--nproc-per-node {here} is more than the {devices} CUDA devices.")
+    if devices:
+        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
+    store, number, size = next(dist.rendezvous("env://"))
+    # torchrun's store outlives a restart, and holds the addresses of the dead.
+    store = dist.PrefixStore(os.environ["TORCHELASTIC_RESTART_COUNT"], store)
+    backend = "cpu:gloo,cuda:nccl" if devices else "gloo"
+    dist.init_process_group(backend, store=store, rank=number, world_size=size)
+    atexit.register(dist.destroy_process_group)  # its threads, left alone, may abort the exit
+
+
+def rank() -> int:
+    """Which of the run's processes this is; 0, the first, writes what is of all of them."""
+    return dist.get_rank() if dist.is_initialized() else 0
+
+
+def processes() -> int:
+    """How many there are."""
+    return dist.get_world_size() if dist.is_initialized() else 1
+
+
+OTHERS_ENDED = "Another process of this run has ended or failed"
+
+
+def gathered(thing: Any) -> list:
+    """One thing of each process, for all of them. A ConnectionError if one of them is gone."""
+    things = [thing] * processes()
+    if processes() > 1:
+        try:
+            dist.all_gather_object(things, thing)
+        except RuntimeError as error:
+            raise ConnectionError(OTHERS_ENDED) from error
+    return things
+
+
+def average_over_processes(tensors: list[Tensor], count: int) -> None:
+    """Put in the place of each its mean over all processes, each weighted by its count, in one
+    message: of gradients of means of so many, that is the gradient of the mean of all."""
+    if processes() == 1:
+        return
+    flat = torch.cat([x.flatten() for x in tensors] + [tensors[0].new_ones(1)]) * count
+    dist.all_reduce(flat)
+    means = (flat[:-1] / flat[-1]).split([x.numel() for x in tensors])
+    for x, mean in zip(tensors, means, strict=True):
+        x.copy_(mean.view_as(x))
+
+
 class Run:
     """All that a run is: environments, agent, replay, random states, counters, and its folder.
 
     The folder holds settings.json; metrics.csv, a row an evaluation; TensorBoard's events; best.pt
     and, at the end, weights.pt, the networks alone; replay.bin; and the last two checkpoints:
     networks, optimisers, random states, what KEPT names, and the checksums of the replay's rows.
+    Of several processes the others have a folder each in it, with their replay and checkpoints.
     """
 
     KEPT = (
@@ -431,9 +493,11 @@ class Run:
         self.s, self.folder = s, folder
         view = s.camera_distance, s.floor_brightness
         self.env, self.eval_env = (make_env(s.env, s.action_repeat, *view) for _ in range(2))
-        torch.manual_seed(s.seed)
-        self.rng = np.random.default_rng(s.seed)
+        torch.manual_seed(s.seed + 2**40 * rank())
+        self.rng = np.random.default_rng(s.seed + 2**40 * rank())
         self.agent = make_agent(s, self.env, device, precision)
+        for value in self.agent.state_dict().values() if processes() > 1 else ():
+            dist.broadcast(value, 0)
         self.step = self.updates = self.episode = 0  # made; made; begun
         self.over, self.length = True, 0  # whether the last episode ended; its environment steps
         self.state: Tensor | None = None  # (1, D), the agent's; None: it has not looked yet
@@ -447,25 +511,31 @@ class Run:
         precision = "bfloat16" if self.agent.bfloat16 else "float32"
         self.machine = f"{self.agent.device}, {precision}, {torch.get_num_threads()} threads, "
         self.machine += f"torch {torch.__version__}"
+        self.machine += f", {processes()} processes" if processes() > 1 else ""
         self.bar = self.writer = None  # open while `train` runs
 
     def open(self) -> None:
         """Take the folder, and its replay, for this process alone; a ValueError if another has."""
+        self.own = self.folder / f"rank-{rank()}" if rank() else self.folder
+        self.own.mkdir(exist_ok=True)
         owner = self.folder / "run.owner"
         try:
-            self.lock = filelock.FileLock(self.folder / "run.lock").acquire(blocking=False)
+            self.lock = filelock.FileLock(self.own / "run.lock").acquire(blocking=False)
         except filelock.Timeout:
             who = f"process {owner.read_text()}" if owner.exists() else "another process"
             raise ValueError(f"{self.folder} is in use by {who}: stop it or wait for it.") from None
         # A checkpoint needs its window of the ring whole until two more are written.
         capacity, self.unsaved = self.s.replay_capacity, min(500, self.s.replay_capacity)
-        actions, file = self.env.action_space.shape[0], self.folder / "replay.bin"
+        actions, file = self.env.action_space.shape[0], self.own / "replay.bin"
         self.replay = Replay(capacity, actions, file, reserve=3 * self.unsaved)
 
     def sign(self) -> None:
         """Say in the folder what its experiment is, and which process goes on with it."""
-        write_whole(self.folder / "run.owner", f"{os.getpid()} on {socket.gethostname()}".encode())
-        write_whole(self.folder / "settings.json", self.s.to_json().encode())
+        gathered(None)  # until all have saved
+        if rank() == 0:
+            owner = f"{os.getpid()} on {socket.gethostname()}"
+            write_whole(self.folder / "run.owner", owner.encode())
+            write_whole(self.folder / "settings.json", self.s.to_json().encode())
 
     def begin_episode(self) -> np.ndarray:
         """Go on to the next episode: its first image."""
@@ -475,13 +545,14 @@ class Run:
 
     def reset(self) -> np.ndarray:
         """The first image of the present episode, whose seed is its own."""
-        seed = np.random.SeedSequence((self.s.seed, self.episode - 1)).generate_state(1)[0] % 2**31
+        number = (self.episode - 1) * processes() + rank()
+        seed = np.random.SeedSequence((self.s.seed, number)).generate_state(1)[0] % 2**31
         return self.env.reset(seed=int(seed))[0]
 
     def note_decision(self, action: np.ndarray, over: bool, info: dict) -> None:
         """Count a decision that was taken."""
         before, self.length = self.length, int(self.env.get_wrapper_attr("episode_lengths"))
-        self.step, self.over = self.step + self.length - before, over
+        self.step, self.over = self.step + sum(gathered(self.length - before)), over
         self.actions.append(action.tolist())  # of numbers: 50,000 tensors take seconds to save
         self.visited.append(info["state"].tolist())
         if over:
@@ -500,8 +571,8 @@ class Run:
     def average(self, metrics: dict[str, float]) -> None:
         """Take metrics into the averages of the next row of metrics.csv."""
         for name, value in metrics.items():
-            total, count = self.averages.get(name, (0.0, 0))
-            self.averages[name] = [total + float(value), count + 1]
+            whole, count = self.averages.get(name, (0.0, 0))
+            self.averages[name] = [whole + float(value), count + 1]
 
     def evaluation_due(self) -> bool:
         """Whether a multiple of `eval_every`, or the end, was passed since the last evaluation."""
@@ -512,17 +583,23 @@ class Run:
     def report(self, episodes: list[Episode]) -> None:
         """A row of metrics.csv and TensorBoard, a line, and best.pt if none was better."""
         self.evaluated_at = self.step
-        if not episodes:
+        own = [(e.total, e.length) for e in episodes], self.visited, self.averages
+        scores, visited, averages = zip(*gathered(own), strict=True)
+        if not any(scores):
             return
-        returns, lengths = np.array([(e.total, e.length) for e in episodes]).T
+        self.averages, self.visited = {}, []
+        if rank():
+            return
+        returns, lengths = np.concatenate([each for each in scores if each]).T
+        names = dict.fromkeys(name for each in averages for name in each)
+        sums = {n: np.sum([each[n] for each in averages if n in each], 0) for n in names}
         row = {
             "env_steps": self.step, "wall_seconds": self.elapsed(),
             "eval_return": returns.mean(), "eval_interval95": interval95(returns),
             "eval_length": lengths.mean(), "eval_length_min": lengths.min(),
-            "eval_length_max": lengths.max(), "coverage": coverage(np.array(self.visited)),
+            "eval_length_max": lengths.max(), "coverage": coverage(np.concatenate(visited)),
             "train_return": float("nan"), "train_length": float("nan"),  # unless an episode ended
-        } | {name: total / count for name, (total, count) in self.averages.items()}  # fmt: skip
-        self.averages, self.visited = {}, []
+        } | {name: whole / count for name, (whole, count) in sums.items()}  # fmt: skip
         self.rows.append({k: str(v) if k == "env_steps" else f"{v:.6g}" for k, v in row.items()})
         table = io.StringIO()
         writer = csv.DictWriter(table, dict.fromkeys(k for row in self.rows for k in row), "nan")
@@ -550,14 +627,14 @@ class Run:
     def save_if_due(self) -> None:
         """Write a checkpoint every `checkpoint_minutes`, and before the ring's reserve is full."""
         waited = time.monotonic() - self.clock >= 60 * self.s.checkpoint_minutes
-        if waited or self.replay.added - self.saved_rows >= self.unsaved:
+        if any(gathered(waited or self.replay.added - self.saved_rows >= self.unsaved)):
             self.save()
 
     def save(self) -> None:
         """Write a checkpoint, whole or not at all (an OSError); the one before it is kept."""
         self.seconds, self.clock = self.elapsed(), time.monotonic()
         self.saved_rows = self.replay.added
-        newest, previous = (self.folder / name for name in CHECKPOINTS)
+        newest, previous = (self.own / name for name in CHECKPOINTS)
         content = {
             "agent": self.agent.state_dict(),
             "optimisers": {name: o.state_dict() for name, o in self.agent.optimisers.items()},
@@ -573,14 +650,14 @@ class Run:
     def load(self) -> None:
         """Go back to the newest whole checkpoint, and say what is not as it was. A ValueError if
         there is none, the replay is not its own, or what may not change differs."""
-        path, saved = read_checkpoint(self.folder)
+        path, saved = read_checkpoint(self.own)
         made, now, here = json.loads(saved["settings"]), dataclasses.asdict(self.s), self.machine
         changed = [name for name in now if now[name] != made.get(name)]
         if fixed := [f"{name} {made.get(name)}" for name in changed if name not in CHANGEABLE]:
             raise ValueError(f"{self.folder} keeps its own {', '.join(fixed)}; {RESUME_TAKES}.")
         vars(self).update(saved["kept"])
         self.replay.restore(self.saved_rows, saved["checksums"].numpy())
-        load_networks(self.agent, saved["agent"])
+        self.agent.load_state_dict(saved["agent"])
         for name, optimiser in self.agent.optimisers.items():
             now_set = optimiser.state_dict()["param_groups"]  # the rate may have changed since
             optimiser.load_state_dict(saved["optimisers"][name] | {"param_groups": now_set})
@@ -589,9 +666,10 @@ class Run:
         if here != self.machine:
             say(f"Begun on {self.machine}, it goes on on {here}: otherwise than it would have.")
             self.machine = here
-        damaged = self.folder / CHECKPOINTS[0]
-        if path != damaged and damaged.exists():  # it must not take the place of this
-            damaged.replace(damaged.with_suffix(".damaged"))
+        passed_over = self.own / CHECKPOINTS[0]
+        gathered(None)  # where one process cannot go on, none changes anything
+        if path != passed_over and passed_over.exists():  # it must not take the place of this
+            passed_over.replace(passed_over.with_suffix(".damaged"))
         if not self.over:
             self.retrace()
         torch.set_rng_state(saved["torch_random"])
@@ -636,15 +714,27 @@ def write_whole(path: Path, content: object, keep: Path | None = None) -> None:
 
 
 def read_checkpoint(folder: Path) -> tuple[Path, dict]:
-    """The newest whole checkpoint and its path; a ValueError if none is whole. Nothing in it is
-    executed."""
+    """The newest whole checkpoint, and its path, of a moment that all processes have; one killed
+    while it saved may be behind. A ValueError if there is none. Nothing in it is executed."""
+    found = whole_checkpoints(folder)
+    moment, path, saved = next(found)
+    while len(set(moments := gathered(moment))) > 1:
+        if moment == max(moments):
+            moment, path, saved = next(found)
+    return path, saved
+
+
+def whole_checkpoints(folder: Path) -> Iterator[tuple[tuple, Path, dict]]:
+    """The newest first, each with its moment in the run."""
     for path in (folder / name for name in CHECKPOINTS):
         if path.exists():
             with contextlib.suppress(Exception), zipfile.ZipFile(path) as file:  # damage has many
                 if file.testzip() is None:  # each part has the checksum that was written with it
                     saved = torch.load(path, map_location="cpu", weights_only=True)
-                    if "settings" in saved and saved["kept"].keys() == set(Run.KEPT):
-                        return path, saved
+                    kept = saved["kept"]
+                    if "settings" in saved and kept.keys() == set(Run.KEPT):
+                        yield (kept["step"], kept["updates"], kept["evaluated_at"]), path, saved
+                        continue
             say(f"{path} is damaged: looking for the one before it.")
     raise ValueError(f"{folder} holds no whole checkpoint: start a new run in another folder.")
 
@@ -661,14 +751,6 @@ def make_agent(s: Settings, env, device: str = "auto", precision: str = "auto") 
         return Agent(s, env.action_space.shape[0], device, bfloat16)
     except RuntimeError as error:  # sizes that no memory holds
         raise ValueError(f"The networks cannot be made: {str(error).splitlines()[0]}") from None
-
-
-def load_networks(agent: Agent, weights: dict[str, Tensor]) -> None:
-    """Put saved weights into an agent; a ValueError if they are of another."""
-    try:
-        agent.load_state_dict(weights)
-    except RuntimeError as error:
-        raise ValueError(f"Other networks were saved: {error}") from None
 
 
 def has_bfloat16(device: torch.device) -> bool:
@@ -724,8 +806,10 @@ def check(text: str, where: str = "") -> Settings:
         for name in wrong["loc"]:  # none, if it is no JSON
             where += f"--{name.replace('_', '-')} is {wrong['input']}: "
         raise ValueError(f"{where}{wrong['msg']}.") from None
-    rows, least = s.prefill // s.action_repeat, s.prefill + s.train_every
+    n, least = processes(), s.prefill + s.train_every
+    rows = s.prefill // s.action_repeat // n
     for possible, sentence in (
+        (s.batch_size % n == 0, f"--batch-size {s.batch_size} is no multiple of {n} processes"),
         (s.length <= rows, f"--prefill {s.prefill} makes {rows} rows, no --length {s.length}"),
         (s.length <= s.replay_capacity, f"--replay-capacity is less than --length {s.length}"),
         (s.steps >= least, f"--steps {s.steps} leaves no update after --prefill: give {least}"),
@@ -760,15 +844,19 @@ def new_run(command: Command) -> Run:
     """A new run in a folder of its own, made once all else is known to work. A ValueError says
     what is wrong with the command."""
     s = check(command.settings.to_json())
+    if os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0" and not command.run_dir:
+        raise ValueError("--max-restarts needs --run-dir, by which a run that goes on is found.")
     name = f"{s.env}-{s.arm}-{s.preset}-seed{s.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
     folder = folder_named(command.run_dir or "runs/" + re.sub(r"[^\w.-]", "-", name))
     taken = f"{folder} is there already: name another --run-dir, or --resume it."
     if command.run_dir and folder.exists() and any(folder.iterdir()):
         raise ValueError(taken)
     run = Run(s, folder, command.device, command.precision)
-    while run.folder.exists() and not command.run_dir:  # begun in the same second
-        run.folder = run.folder.with_name(run.folder.name + "+")
-    run.folder.mkdir(parents=True, exist_ok=True)
+    if rank() == 0:
+        while run.folder.exists() and not command.run_dir:  # begun in the same second
+            run.folder = run.folder.with_name(run.folder.name + "+")
+        run.folder.mkdir(parents=True, exist_ok=True)
+    run.folder = gathered(run.folder)[0]
     run.open()
     if (run.folder / "settings.json").exists():  # of a process that was faster, and is done
         raise ValueError(taken)
@@ -803,7 +891,13 @@ def main(arguments: list[str]) -> int:
     keep_freed_memory()
     threading.excepthook = leave_out_os_errors
     try:
+        join_processes()
+        if rank():
+            sys.stdout = open(os.devnull, "w")  # the first speaks for all
         command = parse(arguments)
+        restarted = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"
+        if restarted and Path(command.run_dir or "/", "settings.json").exists():
+            command = dataclasses.replace(command, resume=command.run_dir, run_dir="")
         run = new_run(command) if command.resume is None else resumed_run(command)
     except (ValueError, OSError, MemoryError) as error:
         say(error)
@@ -822,17 +916,20 @@ def train_run(run: Run) -> int:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
     size = sum(p.numel() for p in run.agent.parameters() if p.requires_grad) / 1e6
-    disk = min(s.replay_capacity, s.steps // s.action_repeat) * run.replay.dtype.itemsize / 1e9
+    rows = min(s.replay_capacity * processes(), s.steps // s.action_repeat)
+    disk = rows * run.replay.dtype.itemsize / 1e9
     what = f"{s.env}, arm {s.arm}, preset {s.preset}, seed {s.seed}, from step {run.step:,}"
     print(f"{what}: {run.folder}\n{size:.1f} M parameters; {run.machine}; the replay will take "
           f"{disk:.1f} GB of disk", flush=True)  # fmt: skip
-    resume = "Go on with: " + shlex.join([sys.executable, __file__, "--resume", str(run.folder)])
+    launcher = ["torchrun", "--nproc-per-node", os.environ.get("LOCAL_WORLD_SIZE", "1")]
+    launcher = launcher if dist.is_initialized() else [sys.executable]
+    resume = "Go on with: " + shlex.join([*launcher, __file__, "--resume", str(run.folder)])
     every = 0.5 if sys.stderr.isatty() else 30  # seconds between two lines of a log file
     try:
-        with (
-            tqdm(total=s.steps, initial=run.step, unit="step", mininterval=every) as run.bar,
-            SummaryWriter(run.folder, purge_step=run.step + 1) as run.writer,
-        ):
+        bar = tqdm(
+            total=s.steps, initial=run.step, unit="step", mininterval=every, disable=rank() > 0
+        )
+        with bar as run.bar, SummaryWriter(run.own, purge_step=run.step + 1) as run.writer:
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
                 if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
                     signal.signal(number, stop)
@@ -854,20 +951,24 @@ def explained(error: Exception, run: Run) -> str:
     if isinstance(error, EnvironmentFault):
         run.over = True  # whoever goes on begins another episode
         with contextlib.suppress(OSError):
-            run.save()
-            return f"{error} What was learnt is saved."
+            if processes() == 1:  # no other could go on from here
+                run.save()
+                return f"{error} What was learnt is saved."
         return str(error)
     if isinstance(error, OSError):
         return f"{error}: stopped; what was saved before is whole."
     if isinstance(error, MemoryError) or "alloc" in str(error):
         size = f"--batch-size {run.s.batch_size} and --length {run.s.length}"
         return f"No memory for an update of {size}: {reason}"
+    if dist.is_initialized() and re.search("gloo|NCCL", str(error)):
+        return f"{OTHERS_ENDED}: stopped; what was saved before is whole."
     raise error
 
 
 def say(text: object) -> None:
     """One sentence for the user, beside the progress."""
-    tqdm.write(" ".join(str(text).splitlines()) or repr(text), file=sys.stderr)
+    who = f"Process {rank()}: " if rank() else ""
+    tqdm.write(who + (" ".join(str(text).splitlines()) or repr(text)), file=sys.stderr)
 
 
 def leave_out_os_errors(thrown: threading.ExceptHookArgs) -> None:

@@ -24,6 +24,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import torch
+import torch.distributed as dist
 import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.distributions import Normal, kl_divergence
@@ -357,5 +358,10 @@ class WorldModel(nn.Module):
 
 
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
-    """Mean of x where mask is 1; 0 where it is nowhere."""
-    return (x * mask).sum() / mask.sum().clamp(min=1)
+    """Mean of x where mask is 1, in the whole batch; 0 where it is nowhere."""
+    both = torch.stack([(x * mask).sum(), mask.sum()])
+    if dist.is_initialized():  # the gradients of the processes that share the batch are averaged
+        mean = both.detach().clone()
+        dist.all_reduce(mean)
+        both = both + (mean / dist.get_world_size() - both.detach())
+    return both[0] / both[1].clamp(min=1e-6)  # averaged, a number may be less than 1

@@ -41,7 +41,10 @@ def load(folder: Path, checkpoint: str, device: str, precision: str):
             raise ValueError(f"{folder} was not evaluated yet: it has no best.pt.") from None
         except Exception as error:  # damage has many
             raise ValueError(f"{path} is damaged: {type(error).__name__}.") from None
-    train.load_networks(agent, weights)
+    try:
+        agent.load_state_dict(weights)
+    except RuntimeError as error:
+        raise ValueError(f"Other networks were saved: {' '.join(str(error).split())}") from None
     return s, env, agent, name
 
 
