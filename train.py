@@ -654,7 +654,8 @@ class Run:
         made, now, here = json.loads(saved["settings"]), dataclasses.asdict(self.s), self.machine
         changed = [name for name in now if now[name] != made.get(name)]
         if fixed := [f"{name} {made.get(name)}" for name in changed if name not in CHANGEABLE]:
-            raise ValueError(f"{self.folder} keeps its own {', '.join(fixed)}; {RESUME_TAKES}.")
+            raise ValueError(f"{self.folder} keeps its own {', '.join(fixed)}; --resume takes "
+                             f"{', '.join(CHANGEABLE)}.")  # fmt: skip
         vars(self).update(saved["kept"])
         self.replay.restore(self.saved_rows, saved["checksums"].numpy())
         self.agent.load_state_dict(saved["agent"])
@@ -697,7 +698,6 @@ CHANGEABLE = (
     "steps", "eval_every", "eval_episodes", "eval_max_steps", "checkpoint_minutes", "model_lr",
     "actor_lr", "critic_lr", "mdn_lr", "grad_clip",
 )  # fmt: skip
-RESUME_TAKES = f"--resume takes {', '.join(CHANGEABLE)}"
 
 
 def write_whole(path: Path, content: object, keep: Path | None = None) -> None:
@@ -873,7 +873,7 @@ def resumed_run(command: Command) -> Run:
     """The run of a folder, from its newest checkpoint, with the settings that changed. A ValueError
     says why it cannot go on, or not with these."""
     if command.run_dir:
-        raise ValueError(f"--resume keeps the run's own run_dir; {RESUME_TAKES}.")
+        raise ValueError("--resume keeps the run's own run_dir: leave out --run-dir.")
     s, folder = check(command.settings.to_json()), folder_named(command.resume)
     run = Run(s, folder, command.device, command.precision)
     run.open()
