@@ -37,7 +37,8 @@ def silence():
                 last.callback(os.close, copy := os.dup(stream))
                 last.callback(os.dup2, copy, stream)
                 os.dup2(null.fileno(), stream)
-        last.callback(ctypes.pythonapi.fflush, None)  # else C prints later, to a pipe
+        if hasattr(ctypes.pythonapi, "fflush"):  # else C prints later, to a pipe; not on Windows
+            last.callback(ctypes.pythonapi.fflush, None)
         yield
 
 

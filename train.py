@@ -930,8 +930,9 @@ def train_run(run: Run) -> int:
             total=s.steps, initial=run.step, unit="step", mininterval=every, disable=rank() > 0
         )
         with bar as run.bar, SummaryWriter(run.own, purge_step=run.step + 1) as run.writer:
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-                if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
+            hangup = getattr(signal, "SIGHUP", signal.SIGINT)  # Windows has none
+            for number in (signal.SIGINT, signal.SIGTERM, hangup):
+                if number != hangup or signal.getsignal(number) != signal.SIG_IGN:  # nohup
                     signal.signal(number, stop)
             train(run, stopped.is_set)
     except (RuntimeError, ArithmeticError, MemoryError, OSError) as error:
