@@ -122,6 +122,7 @@ class Settings:
     critic_lr: Amount = 8e-5  # of each critic (Dreamer)
     mdn_lr: Amount = 2e-4  # of the mixture density network (§5)
     grad_clip: Amount = 100.0  # largest global gradient norm of an optimiser step (Dreamer)
+    overshoot: Annotated[int, Interval(ge=0, le=1000)] = 0  # steps ahead that rewards learn (ours)
     free_nats: Amount = 3.0  # KL below this costs nothing; of `kl` only (Dreamer)
     image_weight: Amount = 1.0  # weight of the image's loss (Dreamer)
     reward_weight: Amount = 1.0  # of the reward's loss (Dreamer)
@@ -180,7 +181,7 @@ def update(
     }  # fmt: skip
     with agent.autocast():
         terms, states = agent.model.loss(batch)
-        loss = sum(weights[name] * term for name, term in terms.items())
+        loss = sum(weights[name.removesuffix("_ahead")] * term for name, term in terms.items())
     metrics = {f"model/{name}": term for name, term in terms.items()}
     metrics["reward_r2"] = reward_r2(agent, states, batch)
     agent.step("model", loss, metrics)
@@ -353,7 +354,7 @@ class Agent(nn.Module):
             termination=s.termination, fixed_prior=s.fixed_prior,
             smooth_l1=s.smooth_l1 and not s.squared_reward,
             decode_stoch_only=s.decode_stoch_only, observe_first=s.observe_first,
-            free_nats=s.free_nats,
+            free_nats=s.free_nats, overshoot=s.overshoot,
         )  # fmt: skip
         size = self.model.size
         self.actors = nn.ModuleDict({"stochastic": actors.StochasticActor(size, actions, s.units)})
