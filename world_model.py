@@ -143,14 +143,14 @@ class Decoder(nn.Module):
         (M, inputs), (M, 64, 64, 3) uint8 -> (M,)."""
 
         def part(x: Tensor, image: Tensor) -> Tensor:
-            return 0.5 * (self(x) - centre(image)).square().flatten(1).sum(1)
+            return 0.5 * F.mse_loss(self(x), centre(image), reduction="none").flatten(1).sum(1)
 
         return in_slices(part, x, image)
 
 
 def centre(image: Tensor) -> Tensor:
     """uint8 pixels to [−0.5, 0.5]."""
-    return image.float() / 255 - 0.5
+    return image.float().div_(255).sub_(0.5)
 
 
 def normal(statistics: Tensor) -> Normal:
