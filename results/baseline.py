@@ -28,6 +28,7 @@ import train
 from env import Foreign, coverage, make_env
 from results.made_with import made_with
 
+COLUMNS = "env_steps wall_seconds eval_return eval_interval95 eval_length coverage".split()
 EVERY, EPISODES, STACK, ROWS = 5_000, 10, 3, 50_000  # ROWS: of a replay of images, 4 GB
 USUAL = {  # by its name in plot.py, what its settings.json holds beside env and seed
     "sac-states": {"steps": 100_000, "minutes": None, "action_repeat": 1},
@@ -70,8 +71,8 @@ class Record:
         # as many states as train.py has of so many steps: coverage depends on their number
         if train.passed(last, self.step, train.Settings.action_repeat):
             self.visited.append(info["state"])
-        minutes = self.settings["minutes"] or float("inf")
-        ends = self.step >= self.settings["steps"] or self.elapsed() >= 60 * minutes
+        late = self.elapsed() >= 60 * (self.settings["minutes"] or float("inf"))
+        ends = late or self.step >= self.settings["steps"]
         if ends or train.passed(last, self.step, EVERY):
             self.report(local["self"])
         return not ends
@@ -84,39 +85,27 @@ class Record:
         """A row of metrics.csv, and a line."""
         played = [episode(model, self.world, 2**31 - 1 - k) for k in range(EPISODES)]
         returns, lengths = np.array(played).T
-        row = {
-            "env_steps": self.step,
-            "wall_seconds": f"{self.elapsed():.6g}",
-            "eval_return": f"{returns.mean():.6g}",
-            "eval_interval95": f"{train.interval95(returns):.6g}",
-            "eval_length": f"{lengths.mean():.6g}",
-            "coverage": f"{coverage(np.array(self.visited)):.6g}",
-        }
-        self.visited = []
+        covered, self.visited = coverage(np.array(self.visited)), []
+        found = returns.mean(), train.interval95(returns), lengths.mean(), covered
+        row = [self.step, *(f"{value:.6g}" for value in (self.elapsed(), *found))]
         with open(self.folder / "metrics.csv", "a", newline="") as file:
-            table = csv.DictWriter(file, row)
-            if file.tell() == 0:
-                table.writeheader()
-            table.writerow(row)
-        print(*(f"{name} {value}" for name, value in row.items()), flush=True)
+            csv.writer(file).writerows([row] if file.tell() else [COLUMNS, row])
+        print(*(f"{name} {value}" for name, value in zip(COLUMNS, row, strict=True)), flush=True)
 
 
 def learn(settings: dict, folder: Path, sb3) -> None:
     """A run of SB3's SAC from beginning to end."""
     arm, vector = settings["arm"], sb3.common.vec_env
+    worlds = [vector.DummyVecEnv([lambda: make_world(arm, settings["env"])]) for _ in range(2)]
     own = {"policy": "MlpPolicy"}
     if arm == "sac-pixels":
+        worlds = [vector.VecFrameStack(world, STACK) for world in worlds]
         own = {"policy": "CnnPolicy", "buffer_size": ROWS}
-
-    def world():
-        made = vector.DummyVecEnv([lambda: make_world(arm, settings["env"])])
-        return vector.VecFrameStack(made, STACK) if arm == "sac-pixels" else made
-
-    model = sb3.SAC(**own, env=world(), seed=settings["seed"])
+    model = sb3.SAC(env=worlds[0], seed=settings["seed"], **own)
     (folder / "settings.json").write_text(json.dumps(settings, indent=2) + "\n")
     by = made_with() | {"threads": torch.get_num_threads(), "stable_baselines3": sb3.__version__}
     (folder / "made_with.json").write_text(json.dumps([by], indent=2) + "\n")
-    model.learn(settings["steps"], Record(settings, folder, world()))
+    model.learn(settings["steps"], Record(settings, folder, worlds[1]))
 
 
 def main(arguments: list[str]) -> int:

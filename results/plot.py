@@ -23,6 +23,7 @@ import numpy as np
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
+from results.baseline import USUAL
 from train import ARMS, Patient, default_settings, interval95
 
 # What may differ between runs of one line: who, where and how looked at, not what is learnt.
@@ -37,8 +38,10 @@ COLUMNS = set("env_steps wall_seconds eval_return eval_interval95 eval_length co
 def label(settings: dict) -> str:
     """The arm and the settings that the run changes in it: no line mixes two experiments. A file of
     another version is held to what it has: a setting that it lacks is not changed."""
-    usual = dataclasses.asdict(default_settings(settings["arm"], settings["preset"]))
-    usual["preset"] = default_settings().preset
+    usual = USUAL.get(settings["arm"])  # of no arm of ours, but of baseline.py's
+    if usual is None:
+        usual = dataclasses.asdict(default_settings(settings["arm"], settings["preset"]))
+        usual["preset"] = default_settings().preset
     changed = [k for k, v in settings.items() if k not in NOT_LEARNT and v != usual.get(k)]
     return ", ".join([settings["arm"]] + [f"{k} {settings[k]}" for k in changed if k != "arm"])
 
