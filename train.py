@@ -42,7 +42,7 @@ from tqdm import tqdm
 import actors
 from actors import Episode, act, actor_loss, critic_loss, explore, imagined_returns, nudge, play
 from env import EnvironmentFault, Replay, coverage, make_env
-from mdn import MixtureDensityNetwork, entropy, mdn_loss, soft_update
+from mdn import MixtureDensityNetwork, entropy, mdn_loss, particle_entropy, soft_update
 from world_model import WorldModel
 
 Arm = Literal["dreamer", "dreamer-maxent", "revised", "maxent"]
@@ -108,6 +108,7 @@ class Settings:
     beta_start: Amount = 0.2  # entropy coefficient β at the first environment step (§5)
     beta_end: Amount = 0.0001  # and at the last, linear between (§5)
     beta_share: bool = False  # β is the norm of ∇Ĥ's part against ∇R's, not a factor on Ĥ (ours)
+    density: Literal["mdn", "knn"] = "mdn"  # whose entropy: §4.1's MDN, or of neighbours' distances
     mdn_components: Size = 8  # components of the mixture density network (§5: heads)
     mdn_units: Size = 256  # its hidden units (§5: 256)
     mdn_min_std: Amount = 0.1  # floor under its σ (ours)
@@ -216,7 +217,11 @@ def update_actor(
         returns = imagined_returns(dream, critic, s.gamma, s.lam)
         terms = {"return": actor_loss(returns, dream.continues, s.first_state_only)}
         if explores:
-            bonus = entropy(agent.target_mdn, dream.state, dream.continues, s.gamma_q).mean()
+            if s.density == "knn":  # on z alone: h has no scale of its own
+                bonus = particle_entropy(dream.state[..., s.deter :], dream.continues, s.gamma_q)
+            else:
+                bonus = entropy(agent.target_mdn, dream.state, dream.continues, s.gamma_q)
+            bonus = bonus.mean()
             metrics["mdn/entropy"] = bonus
             terms["entropy"] = -bonus
         if look and explores:
@@ -233,7 +238,7 @@ def update_actor(
         loss = critic_loss(critic, dream, returns, s.smooth_l1)
     metrics[f"{name}_critic/loss"] = loss
     agent.step(f"{name}_critic", loss, metrics)
-    if explores:
+    if explores and s.density == "mdn":
         with agent.autocast():
             loss = mdn_loss(agent.mdn, dream.state, dream.continues, s.gamma_q).mean()
         metrics["mdn/nll"] = loss
@@ -376,12 +381,13 @@ class Agent(nn.Module):
             self.critics[name] = critic
             learners[f"{name}_actor"] = actor, s.actor_lr
             learners[f"{name}_critic"] = critic, s.critic_lr
-        if s.entropy:
+        if s.entropy and s.density == "mdn":
             sizes = size, s.mdn_components, s.mdn_units, s.mdn_min_std
             self.mdn, self.target_mdn = (MixtureDensityNetwork(*sizes) for _ in range(2))
             self.target_mdn.load_state_dict(self.mdn.state_dict())
             self.target_mdn.requires_grad_(False)
             learners["mdn"] = self.mdn, s.mdn_lr
+        if s.entropy:
             self.register_buffer("gradient_norms", torch.zeros(2))  # of ∇R and ∇Ĥ, averaged
         self.to(device)
         self.optimisers = {
@@ -807,6 +813,8 @@ def check(text: str, where: str = "") -> Settings:
          f"{s.length}: raise the one or lower the other."),
         (s.steps < least, f"--steps {s.steps} leaves nothing to train after --prefill {s.prefill}: "
          f"raise it to {least} or more."),
+        (s.density == "knn" and s.starts * s.batch_size * (s.length // 2) < 4,
+         "--density knn needs four states to dream from: raise --batch-size or --length."),
         (s.eval_every < s.train_every, f"--eval-every {s.eval_every} is less than --train-every "
          f"{s.train_every}: raise it to that."),
     ):  # fmt: skip
