@@ -44,7 +44,7 @@ from tqdm import tqdm
 import actors
 from actors import Episode, act, actor_loss, critic_loss, explore, imagined_returns, nudge, play
 from env import EnvironmentFault, Replay, coverage, make_env
-from mdn import MixtureDensityNetwork, entropy, mdn_loss, soft_update
+from mdn import MixtureDensityNetwork, entropy, mdn_loss, particle_entropy, soft_update
 from world_model import WorldModel
 
 Arm = Literal["dreamer", "dreamer-maxent", "revised", "maxent"]
@@ -110,6 +110,7 @@ class Settings:
     beta_start: Amount = 0.2  # entropy coefficient β at the first environment step (§5)
     beta_end: Amount = 0.0001  # and at the last, linear between (§5)
     beta_share: bool = False  # β is the norm of ∇Ĥ's part against ∇R's, not a factor on Ĥ (ours)
+    density: Literal["mdn", "knn"] = "mdn"  # whose entropy: §4.1's MDN, or of neighbours' distances
     mdn_components: Size = 8  # components of the mixture density network (§5: heads)
     mdn_units: Size = 256  # its hidden units (§5: 256)
     mdn_min_std: Amount = 0.1  # floor under its σ (ours)
@@ -219,7 +220,11 @@ def update_actor(
         returns = imagined_returns(dream, critic, s.gamma, s.lam)
         terms = {"return": actor_loss(returns, dream.continues, s.first_state_only)}
         if explores:
-            bonus = entropy(agent.target_mdn, dream.state, dream.continues, s.gamma_q).mean()
+            if s.density == "knn":  # on z alone: h has no scale of its own
+                bonus = particle_entropy(dream.state[..., s.deter :], dream.continues, s.gamma_q)
+            else:
+                bonus = entropy(agent.target_mdn, dream.state, dream.continues, s.gamma_q)
+            bonus = bonus.mean()
             metrics["mdn/entropy"] = bonus
             terms["entropy"] = -bonus
         if look and explores:
@@ -236,7 +241,7 @@ def update_actor(
         loss = critic_loss(critic, dream, returns, s.smooth_l1)
     metrics[f"{name}_critic/loss"] = loss
     agent.step(f"{name}_critic", loss, metrics, len(starts))
-    if explores:
+    if explores and s.density == "mdn":
         with agent.autocast():
             loss = mdn_loss(agent.mdn, dream.state, dream.continues, s.gamma_q).mean()
         metrics["mdn/nll"] = loss
@@ -370,12 +375,13 @@ class Agent(nn.Module):
             self.critics[name] = critic
             learners[f"{name}_actor"] = actor, s.actor_lr
             learners[f"{name}_critic"] = critic, s.critic_lr
-        if s.entropy:
+        if s.entropy and s.density == "mdn":
             sizes = size, s.mdn_components, s.mdn_units, s.mdn_min_std
             self.mdn, self.target_mdn = (MixtureDensityNetwork(*sizes) for _ in range(2))
             self.target_mdn.load_state_dict(self.mdn.state_dict())
             self.target_mdn.requires_grad_(False)
             learners["mdn"] = self.mdn, s.mdn_lr
+        if s.entropy:
             self.register_buffer("gradient_norms", torch.zeros(2))  # of ∇R and ∇Ĥ, averaged
         self.to(device)
         self.optimisers = {
@@ -809,12 +815,14 @@ def check(text: str, where: str = "") -> Settings:
         raise ValueError(f"{where}{wrong['msg']}.") from None
     n, least = processes(), s.prefill + s.train_every
     rows = s.prefill // s.action_repeat // n
+    few = s.density == "knn" and s.starts * s.batch_size * (s.length // 2) < 4 * n
     for possible, sentence in (
         (s.batch_size % n == 0, f"--batch-size {s.batch_size} is no multiple of {n} processes"),
         (s.length <= rows, f"--prefill {s.prefill} makes {rows} rows, no --length {s.length}"),
         (s.length <= s.replay_capacity, f"--replay-capacity is less than --length {s.length}"),
         (s.steps >= least, f"--steps {s.steps} leaves no update after --prefill: give {least}"),
         (s.eval_every >= s.train_every, f"--eval-every is less than --train-every {s.train_every}"),
+        (not few, "--density knn needs four states to dream from: raise --batch-size or --length"),
     ):
         if not possible:
             raise ValueError(f"{where}{sentence}.")

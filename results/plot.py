@@ -4,8 +4,9 @@
 
 draws FOLDER/curves.png (results/ if none is given), one column of panels an environment, one line
 an arm: the mean over its runs and its 95% t-interval, each run as a thin line; above, returns of
-evaluation beside what actions earn that look at nothing; below, how much of the environment's own
-state space the collected rows cover. Writes FOLDER/table.md.
+evaluation beside what actions earn that look at nothing; then how much of the environment's own
+state space the collected rows cover; below, that coverage against the agent's own estimate of the
+entropy of its future states, which it maximises. Writes FOLDER/table.md.
 """
 
 import argparse
@@ -20,9 +21,11 @@ from pathlib import Path
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
+from scipy import stats
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
+from results.baseline import USUAL
 from train import ARMS, Patient, default_settings, interval95
 
 # What may differ between runs of one line: who, where and how looked at, not what is learnt.
@@ -37,8 +40,10 @@ COLUMNS = set("env_steps wall_seconds eval_return eval_interval95 eval_length co
 def label(settings: dict) -> str:
     """The arm and the settings that the run changes in it: no line mixes two experiments. A file of
     another version is held to what it has: a setting that it lacks is not changed."""
-    usual = dataclasses.asdict(default_settings(settings["arm"], settings["preset"]))
-    usual["preset"] = default_settings().preset
+    usual = USUAL.get(settings["arm"])  # of no arm of ours, but of baseline.py's
+    if usual is None:
+        usual = dataclasses.asdict(default_settings(settings["arm"], settings["preset"]))
+        usual["preset"] = default_settings().preset
     changed = [k for k, v in settings.items() if k not in NOT_LEARNT and v != usual.get(k)]
     return ", ".join([settings["arm"]] + [f"{k} {settings[k]}" for k in changed if k != "arm"])
 
@@ -111,60 +116,144 @@ def draw_curve(axes, runs: dict[str, dict], column: str, name: str, color: str) 
     axes.fill_between(steps, mean - half, mean + half, color=color, alpha=0.12, linewidth=0)
 
 
+def draw_against(axes, runs: dict[str, dict], name: str, color: str) -> None:
+    """One experiment's coverage against Ĥ, a line a run through its evaluations, a dot at the last;
+    Spearman's ρ of the two, its mean over runs. Nothing if no entropy was estimated."""
+    found = []
+    for run in runs.values():
+        both = np.array([run.get("mdn/entropy", np.nan * run["coverage"]), run["coverage"]])
+        both = both[:, np.isfinite(both).all(0)]
+        axes.plot(*both, color=color, alpha=0.5, linewidth=0.8)
+        axes.plot(*both[:, -1:], "o", color=color, markersize=4)
+        if both.shape[1] > 2 and np.ptp(both, axis=1).all():
+            found.append(stats.spearmanr(*both).statistic)
+    if found:
+        axes.plot([], [], color=color, label=f"{name}: ρ {np.mean(found):.2f}")
+
+
+def draw_env(panels, env: str, arms, reference, colors) -> None:
+    """The column of panels of an environment."""
+    above, below, against = panels
+    above.sharex(below)
+    earned = {p: float(reference[env, p]["return"]) for p in POLICIES if (env, p) in reference}
+    for policy, value in earned.items():
+        above.axhline(value, color="grey", linestyle=POLICIES[policy], label=f"{policy} actions")
+    for axes, column in ((above, "eval_return"), (below, "coverage")):
+        for name, of in arms.items():
+            draw_curve(axes, of, column, name, colors[name])
+        values = np.concatenate([run[column] for of in arms.values() for run in of.values()])
+        values = [*values[np.isfinite(values)], *(earned.values() if axes is above else ())]
+        if values:  # an interval over two runs may leave the panel
+            margin = 0.1 * np.ptp(values) + 1
+            axes.set_ylim(min(values) - margin, max(values) + margin)
+    for name, of in arms.items():
+        draw_against(against, of, name, colors[name])
+    above.set(title=env, ylabel="evaluation return")
+    below.set(xlabel="environment steps", ylabel="coverage of states, nats")
+    against.set(xlabel="Ĥ of states to come, nats", ylabel="coverage of states, nats")
+    for axes, of in ((below, above), (against, against)):
+        lines, labels = of.get_legend_handles_labels()
+        labels = [textwrap.fill(text, 60) for text in labels]  # there are arms with many changes
+        if lines:
+            axes.legend(lines, labels, fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.2))
+
+
 def draw(path: Path, runs, reference) -> None:
     """Writes the figure."""
     names = dict.fromkeys([*ARMS, *sorted({name for arms in runs.values() for name in arms})])
     colors = {name: f"C{k}" for k, name in enumerate(names)}  # an arm has one colour everywhere
-    figure = plt.figure(figsize=(5 * len(runs), 8), layout="constrained")
-    panels = figure.subplots(2, len(runs), sharex="col", squeeze=False)
-    for (env, arms), (above, below) in zip(sorted(runs.items()), panels.T, strict=True):
-        earned = {p: float(reference[env, p]["return"]) for p in POLICIES if (env, p) in reference}
-        for policy, value in earned.items():
-            above.axhline(
-                value, color="grey", linestyle=POLICIES[policy], label=f"{policy} actions"
-            )
-        for axes, column in ((above, "eval_return"), (below, "coverage")):
-            for name, of in arms.items():
-                draw_curve(axes, of, column, name, colors[name])
-            values = np.concatenate([run[column] for of in arms.values() for run in of.values()])
-            values = [*values[np.isfinite(values)], *(earned.values() if axes is above else ())]
-            if values:  # an interval over two runs may leave the panel
-                margin = 0.1 * np.ptp(values) + 1
-                axes.set_ylim(min(values) - margin, max(values) + margin)
-        above.set(title=env, ylabel="evaluation return")
-        below.set(xlabel="environment steps", ylabel="coverage of states, nats")
-        lines, labels = above.get_legend_handles_labels()
-        labels = [textwrap.fill(text, 60) for text in labels]  # there are arms with many changes
-        below.legend(lines, labels, fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.2))
+    figure = plt.figure(figsize=(5 * len(runs), 13), layout="constrained")
+    panels = figure.subplots(3, len(runs), squeeze=False)
+    for (env, arms), column in zip(sorted(runs.items()), panels.T, strict=True):
+        draw_env(column, env, arms, reference, colors)
     figure.savefig(path, dpi=90, metadata={"Software": None})
 
 
+def score(run: dict, end: float) -> float:
+    """What a run earns: its mean evaluation over the last fifth of the steps up to `end`, at five
+    points, between evaluations on a straight line. The last one alone is ten episodes' luck. nan
+    if it was not evaluated by then."""
+    if run["env_steps"][0] > 1.01 * end:  # an evaluation may be a step late
+        return float("nan")
+    return np.interp(np.linspace(0.8 * end, end, 5), run["env_steps"], run["eval_return"]).mean()
+
+
+def covered(run: dict, end: float) -> float:
+    """Its mean coverage up to `end`, in nats; nan if it was not evaluated by then."""
+    seen = run["coverage"][run["env_steps"] <= 1.01 * end]
+    return seen.mean() if seen.size else float("nan")
+
+
+def iqm(values: np.ndarray, axis: int = -1) -> np.ndarray:
+    """Interquartile mean: without a quarter of the values at either end, rounded down (Agarwal et
+    al. 2021); of fewer than four, the mean."""
+    return stats.trim_mean(values, 0.25, axis=axis)
+
+
+def over_seeds(
+    *samples: list[float], signs: tuple[float, ...] = (1,)
+) -> tuple[float, float, float]:
+    """Σ sign · IQM of samples, and its 95% percentile bootstrap interval over seeds (Agarwal et al.
+    2021); nan where a sample has a single seed or a nan. Of two seeds it is what lies between."""
+
+    def statistic(*samples, axis=-1):
+        return sum(sign * iqm(x, axis) for sign, x in zip(signs, samples, strict=True))
+
+    low = high = float("nan")
+    if min(map(len, samples)) > 1 and np.isfinite(np.concatenate(samples)).all():
+        low, high = stats.bootstrap(
+            samples, statistic, method="percentile", rng=0
+        ).confidence_interval
+    return float(statistic(*map(np.array, samples))), float(low), float(high)
+
+
+def shown(found: tuple[float, float, float]) -> str:
+    """What `over_seeds` found."""
+    middle, low, high = found
+    return f"{middle:.1f} [{low:.1f}, {high:.1f}]" if np.isfinite(low) else f"{middle:.1f}"
+
+
 def table(runs, reference) -> str:
-    """A line a run: its last and its best evaluation, and what it covered on average."""
+    """A line a run: its last and its best evaluation, what it earned in the last fifth of its steps
+    and what it covered on average; a line a group of seeds."""
     columns = (
-        "environment | arm | seed | steps | minutes | last return | best return | last length | "
-        "mean coverage, nats"
+        "environment | arm | seed | steps | minutes | last return | best return | last fifth | "
+        "last length | mean coverage, nats"
     )
-    lines = [columns, " | ".join(9 * ["---"])]
+    lines = [columns, " | ".join(10 * ["---"])]
     for env, arms in sorted(runs.items()):
         for policy in POLICIES:
             if row := reference.get((env, policy)):
-                earned = (
-                    f"– | – | – | {row['return']} ± {row['interval95']} | – | {row['length']} | –"
-                )
-                lines.append(f"{env} | {policy} actions | {earned}")
+                earned = f"{row['return']} ± {row['interval95']} | – | – | {row['length']} | –"
+                lines.append(f"{env} | {policy} actions | – | – | – | {earned}")
         for name, of in arms.items():
-            for seed, run in sorted(of.items()):
-                last = {column: values[-1] for column, values in run.items()}
-                half = last["eval_interval95"]
-                spread = f" ± {half:.1f}" if np.isfinite(half) else ""  # of one episode: none
-                lines.append(
-                    f"{env} | {name} | {seed} | {last['env_steps']:,.0f} | "
-                    f"{last['wall_seconds'] / 60:.0f} | {last['eval_return']:.1f}{spread} | "
-                    f"{run['eval_return'].max():.1f} | {last['eval_length']:.0f} | "
-                    f"{run['coverage'].mean():.1f}"
-                )
+            rows = [row_of(seed, run, len(of) == 1) for seed, run in sorted(of.items())]
+            lines += [f"{env} | {name} | {row}" for row in rows + rows_of_all(of)]
     return "".join(f"| {line} |\n" for line in lines)
+
+
+def row_of(seed: str, run: dict, alone: bool) -> str:
+    """A run's row from its seed on; with the interval over an evaluation's episodes if no other
+    seed tells how far runs differ."""
+    last = {column: values[-1] for column, values in run.items()}
+    half, end = last["eval_interval95"], last["env_steps"]
+    spread = f" ± {half:.1f}" if alone and np.isfinite(half) else ""  # of one episode: none
+    return (
+        f"{seed} | {end:,.0f} | {last['wall_seconds'] / 60:.0f} | "
+        f"{last['eval_return']:.1f}{spread} | {run['eval_return'].max():.1f} | "
+        f"{score(run, end):.1f} | {last['eval_length']:.0f} | {covered(run, end):.1f}"
+    )
+
+
+def rows_of_all(runs: dict[str, dict]) -> list[str]:
+    """The row of a group of seeds, up to where all of them are; none of a single one."""
+    if len(runs) == 1:
+        return []
+    end = min(run["env_steps"][-1] for run in runs.values())
+    earned, seen = (
+        shown(over_seeds([of(run, end) for run in runs.values()])) for of in (score, covered)
+    )
+    return [f"**IQM of {len(runs)}** | {end:,.0f} | – | – | – | {earned} | – | {seen}"]
 
 
 def main(arguments: list[str]) -> int:

@@ -513,6 +513,21 @@ def test_beta_share_gives_the_entropys_gradient_that_share_of_the_returns():
     assert literal.entropy_scale == 1
 
 
+@pytest.mark.parametrize("bfloat16", [False, True])
+def test_neighbours_take_the_place_of_the_mdn(bfloat16):
+    """No MDN is there to be trained; the explorer alone follows the entropy, that of z alone."""
+    s = tiny("maxent", density="knn")
+    assert not {"mdn", "target_mdn"} & networks(make_agent(s)).keys()
+    one, other = (updated(s, beta, bfloat16) for beta in (0.1, 0.0))
+    assert changed(snapshot(one[0]), snapshot(other[0])) == {"stochastic_actor"}
+    assert one[1]["mdn/entropy"] == other[1]["mdn/entropy"] and "mdn/nll" not in one[1]
+    asked = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("train.particle_entropy", lambda z, *_: asked.append(z.shape) or z.sum(-1))
+        updated(s, 0.1, bfloat16)
+    assert [shape[0::2] for shape in asked] == [(s.horizon + 1, s.stoch)]
+
+
 def test_one_vanishing_gradient_does_not_make_an_update_all_entropy():
     """The norms are averaged apart: the mean of their ratios would jump by 1e5."""
     agent = make_agent(tiny("maxent", beta_share=True))

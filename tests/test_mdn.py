@@ -24,6 +24,7 @@ from mdn import (
     discounted_weights,
     entropy,
     mdn_loss,
+    particle_entropy,
     soft_update,
 )
 
@@ -402,6 +403,78 @@ def test_mdn_loss_does_not_move_the_prediction_that_it_bootstraps_from():
     states = torch.arange(3.0).view(3, 1, 1)  # s_t = 0, s_{t+1} = 1, s_{t+2} = 2
     mdn_loss(mdn, states, torch.ones(2, 1), GAMMA).sum().backward()
     assert mdn.mean.grad.ne(0).tolist() == [True, False, False]
+
+
+# The particle estimate
+
+
+WIDTHS = torch.tensor([0.3, 2.0, 1.0])  # σ of the three numbers of a state
+
+
+def crowd(n: int, batch: int, scale: float | torch.Tensor = 1.0) -> torch.Tensor:
+    """States (n + 1, N, 3) whose futures are all of one Gaussian."""
+    return WIDTHS * scale * torch.randn(n + 1, batch, 3) + torch.tensor([5.0, 0.0, -1.0])
+
+
+@pytest.mark.parametrize("k", [1, 3, 10])
+def test_particle_entropy_of_gaussian_states_is_that_of_a_gaussian(k):
+    got = particle_entropy(crowd(8, 2000), torch.ones(8, 2000), GAMMA, k)
+    assert got.shape == (2000,) and got.dtype == torch.float32
+    assert got.mean().item() == pytest.approx(Normal(0, WIDTHS).entropy().sum().item(), abs=0.05)
+
+
+def test_particle_entropy_is_of_the_discounted_states():
+    """States four times as far apart at the later step: the entropy is that of the mixture of both
+    Gaussians with the weights 1 − γ and γ, by quadrature; only the first's where all ends there."""
+    gamma, far = 0.4, 4.0
+    states = torch.randn(3, 3000, 3) * torch.tensor([1.0, 1.0, far]).view(3, 1, 1)
+
+    def surprise(r):  # −p log p at the distance r from the origin, times the sphere's surface
+        near, wide = (
+            stats.norm.pdf(r, scale=s) * stats.norm.pdf(0, scale=s) ** 2 for s in (1, far)
+        )
+        density = (1 - gamma) * near + gamma * wide
+        return -4 * np.pi * r**2 * density * np.log(density)
+
+    got = particle_entropy(states, torch.ones(2, 3000), gamma).mean().item()
+    assert got == pytest.approx(integrate.quad(surprise, 0, 40, limit=200)[0], abs=0.1)
+    ends = torch.tensor([[0.0], [1.0]]).expand(2, 3000)
+    got = particle_entropy(states, ends, gamma).mean().item()
+    assert got == pytest.approx(3 * stats.norm.entropy(), abs=0.1)
+
+
+def test_particle_entropy_gradient_is_that_of_the_gaussian():
+    """∂H/∂s of states s·x is d / s, a little less since a k-th neighbour has some way to it."""
+    scale = torch.ones((), requires_grad=True)
+    got = particle_entropy(crowd(8, 2000, scale), torch.ones(8, 2000), GAMMA).mean()
+    assert torch.autograd.grad(got, scale)[0].item() == pytest.approx(3, rel=0.12)
+
+
+def test_particle_entropy_draws_away_from_the_others_and_leaves_them_where_they_are():
+    """One start's future stands to the right of all the others': only it moves, to the right."""
+    states, continues = imagined(batch=50)
+    with torch.no_grad():
+        states[:, 7] += torch.tensor([6.0, 0.0])
+    particle_entropy(states, continues, GAMMA)[7].backward()
+    assert reached(states.grad) == [False, True, True, True]  # s_t is given
+    assert reached(states.grad.transpose(0, 1)) == [i == 7 for i in range(50)]
+    assert (states.grad[1:, 7, 0] > 0).all()
+    assert reached(continues.grad) == [True, True, False]  # c of s_{t+n}: its mass stays there
+
+
+def test_particle_entropy_takes_no_neighbour_from_its_own_future():
+    """Each start stays where it is: its own future, at distance 0, would be without entropy."""
+    states = torch.randn(1, 2000, 3).expand(9, 2000, 3)
+    got = particle_entropy(states, torch.ones(8, 2000), GAMMA, k=1).mean()
+    assert got.item() == pytest.approx(Normal(0, torch.ones(3)).entropy().sum().item(), abs=0.1)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_particle_entropy_and_its_gradient_are_finite_where_all_states_are_equal(dtype):
+    states = torch.ones(3, 6, 4, dtype=dtype, requires_grad=True)
+    got = particle_entropy(states, torch.ones(2, 6), GAMMA).mean()
+    got.backward()
+    assert got < -20 and got.isfinite() and not states.grad.any()
 
 
 # The target network

@@ -341,6 +341,8 @@ BAD = {
     "--resume nowhere": "nowhere",
     "--resume nowhere --steps 7": "nowhere",
     "--horizon 1000000": "--horizon",
+    "--density knn --batch-size 1 --length 7": "--batch-size",
+    "--density gauss": "knn",
     "--updates 1000000000": "--updates",
     "--eval-episodes 1000000000000": "--eval-episodes",
     "--floor-brightness 2": "--floor-brightness",

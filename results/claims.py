@@ -1,0 +1,180 @@
+"""The paper's five claims (§5, §6) against the runs in a folder, from their files alone.
+
+    python results/claims.py [FOLDER]
+
+prints, claim by claim, comparison by comparison, what was found: the difference of interquartile
+means over seeds and its 95% bootstrap interval (Agarwal et al. 2021), of what runs earn in the
+last fifth of the steps that all of them made. Supported: the whole interval is where the claim
+says. Refuted: none of it is. Else, or with fewer than three seeds, or none: not enough evidence.
+Beside them, what the paper's argument needs: that the explorer covers more of the environment's own
+states.
+"""
+
+import argparse
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import NamedTuple
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from results import plot
+from results.plot import covered, iqm, over_seeds, score
+from train import ARMS, Patient
+
+LEAST = 3  # seeds: of two against two, one pair is above the other by chance once in six
+MARGIN = 0.1  # on par: closer than this share of what the best arm earns above random actions
+SUPPORTED, REFUTED, OPEN = "supported", "refuted", "not enough evidence"
+HOPPER, WALKER, CHEETAH, ANT = ROBOTS = ("Hopper", "Walker2D", "HalfCheetah", "Ant")
+BLIND = "best blind action"  # of reference.csv: the most that actions earn that look at nothing
+
+
+class Comparison(NamedTuple):
+    """Σ sign · what the arm earns, on one robot, and where the paper says that it lies."""
+
+    robot: str
+    signs: dict[str, int]  # of arms, named as plot.py names them
+    lies: str  # "above" 0, "within" a margin of it, or "not above" that margin
+    what: callable = score  # or `covered`
+
+
+def above(robot: str, arm: str, other: str, what=score) -> Comparison:
+    return Comparison(robot, {arm: 1, other: -1}, "above", what)
+
+
+MAJORITY = {"maxent": 1, "revised": -2, "dreamer": 1}  # (maxent − revised) − (revised − dreamer)
+CLAIMS = {  # each a list of (how many of them must hold, comparisons)
+    "1. The original Dreamer is entirely unable to solve Walker2D and Hopper": [
+        (2, [Comparison(r, {"dreamer": 1, BLIND: -1}, "not above") for r in (WALKER, HOPPER)])
+    ],
+    "2. There the modifications produce a score, and exploration improves it further": [
+        (4, [above(robot, arm, other) for robot in (WALKER, HOPPER)
+             for arm, other in (("revised", "dreamer"), ("maxent", "revised"))])
+    ],
+    "3. On Ant the modifications improve nothing, exploration does, with and without them": [
+        (3, [Comparison(ANT, {"revised": 1, "dreamer": -1}, "not above"),
+             above(ANT, "maxent", "revised"), above(ANT, "dreamer-maxent", "dreamer")])
+    ],
+    "4. On HalfCheetah the modifications alone improve, on par with exploration": [
+        (3, [above(CHEETAH, "revised", "dreamer"),
+             Comparison(CHEETAH, {"revised": 1, "maxent": -1}, "within"),
+             Comparison(CHEETAH, {"revised": 1, "dreamer-maxent": -1}, "within")])
+    ],
+    "5. MaxEnt Dreamer improves on all four, on three most of it by exploration": [
+        (4, [above(robot, "maxent", "dreamer") for robot in ROBOTS]),
+        (3, [Comparison(robot, MAJORITY, "above") for robot in ROBOTS]),
+    ],
+    "The explorer covers more of the environment's states than noise does, and than none": [
+        (8, [above(robot, "maxent", other, covered) for robot in ROBOTS
+             for other in ("revised", "revised, action_noise 0.0")])
+    ],
+}  # fmt: skip
+
+
+def verdict(low: float, high: float, lies: str, margin: float) -> str:
+    """Of an interval, whether all, none or a part of it lies where it should."""
+    infinity = float("inf")
+    least, most = {
+        "above": (0, infinity), "within": (-margin, margin), "not above": (-infinity, margin)
+    }[lies]  # fmt: skip
+    if least < low and high < most:
+        return SUPPORTED
+    return REFUTED if high <= least or low >= most else OPEN
+
+
+def changes(label: str) -> tuple[str, frozenset[str]]:
+    """The arm of a line of plot.py's, and what it changes."""
+    arm, *changed = label.split(", ")
+    return arm, frozenset(changed)
+
+
+def choose(arms: dict, name: str, common: frozenset[str]) -> list[dict]:
+    """Runs of an arm with a change of its own or none, beside those common to all."""
+    arm, own = changes(name)
+    fitting = (runs for label, runs in arms.items() if changes(label) == (arm, own | common))
+    return [run for runs in fitting for run in runs.values()]
+
+
+def compare(comparison: Comparison, arms: dict, common, reference) -> tuple[str, ...]:
+    """Where it should lie, where it does, seeds, steps, verdict."""
+    env = f"{comparison.robot}BulletEnv-v0"
+    signs = {name: sign for name, sign in comparison.signs.items() if name != BLIND}
+    runs = {name: choose(arms, name, common) for name in signs}
+    if missing := [name for name, of in runs.items() if not of]:
+        return comparison.lies, "–", "; ".join(f"no {name}" for name in missing), "–", OPEN
+    end = min(run["env_steps"][-1] for of in runs.values() for run in of)
+    blind = {p: float(reference[env, p]["return"]) for p in plot.POLICIES}
+    shift = comparison.signs.get(BLIND, 0) * max(blind.values())
+    samples = [[comparison.what(run, end) for run in of] for of in runs.values()]
+    found = [x + shift for x in over_seeds(*samples, signs=tuple(signs.values()))]
+    chosen = [choose(arms, arm, common) for arm in ARMS]
+    best = max(iqm([score(run, end) for run in of]) for of in chosen if of)
+    margin = MARGIN * max(0.0, best - blind["random"])
+    seeds = [len(of) for of in runs.values()]
+    said = OPEN if min(seeds) < LEAST else verdict(*found[1:], comparison.lies, margin)
+    bound = {"above": "0", "within": f"±{margin:.3g}", "not above": f"{margin:.3g}"}
+    where = f"{comparison.lies} {bound[comparison.lies]}"
+    return where, plot.shown(found), ", ".join(map(str, seeds)), f"{end:,.0f}", said
+
+
+def judge(groups: list, runs: dict, common, reference) -> tuple[str, list[str]]:
+    """The verdict on a claim, and a row for each of its comparisons."""
+    verdicts, rows = [], []
+    for needed, comparisons in groups:
+        found = []
+        for one in comparisons:
+            arms = runs.get(f"{one.robot}BulletEnv-v0", {})
+            where, *told = compare(one, arms, common, reference)
+            found.append(told[-1])
+            terms = (f"{'+' if n > 0 else '−'} {'2 ' * (abs(n) > 1)}{name}"
+                     for name, n in one.signs.items())  # fmt: skip
+            compared = f"{' '.join(terms).removeprefix('+ ')}: {where}"
+            rows.append(" | ".join([one.robot, compared, *told]))
+        failed = found.count(REFUTED) > len(found) - needed
+        held = found.count(SUPPORTED) >= needed
+        verdicts.append(REFUTED if failed else SUPPORTED if held else OPEN)
+    return next(v for v in (REFUTED, OPEN, SUPPORTED) if v in verdicts), rows
+
+
+def shared_changes(runs: dict) -> list[frozenset[str]]:
+    """The settings that at least two arms of the figure were run with; the usual ones first."""
+    arms = {changes(label) for of in runs.values() for label in of}
+    found = Counter(changed for arm, changed in arms if arm in ARMS)
+    return sorted((c for c, n in found.items() if n > 1), key=lambda c: (len(c), sorted(c)))
+
+
+def report(runs: dict, reference: dict) -> str:
+    """All claims, once for each configuration that there is."""
+    lines = []
+    for common in shared_changes(runs) or [frozenset()]:
+        lines += [f"With {', '.join(sorted(common)) or 'the usual settings'}:", ""]
+        lines += ["| claim, robot | compared | by how much | seeds | steps | verdict |"]
+        lines += [f"|{6 * ' --- |'}"]
+        for claim, groups in CLAIMS.items():
+            said, rows = judge(groups, runs, common, reference)
+            lines += [f"| **{claim}** | | | | | **{said}** |", *(f"| {row} |" for row in rows)]
+        lines += [""]
+    return "\n".join(lines)
+
+
+def main(arguments: list[str]) -> int:
+    """Runs a command line. Returns the exit code: 0 done, 2 bad input."""
+    says = "Holds the paper's claims against all runs below a folder."
+    parser = argparse.ArgumentParser(prog="python results/claims.py", description=says)
+    parser.add_argument(
+        "folder", type=Path, nargs="?", default=plot.HERE, help="runs (%(default)s)"
+    )
+    folder = parser.parse_args(arguments).folder
+    try:
+        runs = plot.read_runs(folder)
+        if not runs:
+            raise ValueError(f"{folder} holds no evaluated run: no claim can be judged.")
+        print(report(runs, plot.read_reference()), end="")
+    except (ValueError, OSError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.stdout, sys.stderr = Patient(sys.stdout), Patient(sys.stderr)
+    sys.exit(main(sys.argv[1:]))

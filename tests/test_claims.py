@@ -1,0 +1,149 @@
+"""results/claims.py and the intervals over seeds: hand-worked numbers, scipy, made-up runs."""
+
+import dataclasses
+import itertools
+import json
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import results.claims as claims
+import results.plot as plot
+from results.claims import OPEN, REFUTED, SUPPORTED
+from train import default_settings
+
+
+def test_interquartile_mean_of_hand_worked_values():
+    assert plot.iqm(np.array([9.0, 1, 2, -50])) == 1.5  # a quarter off at either end
+    assert plot.iqm(np.array([1.0, 2, 6])) == 3  # of fewer than four none
+
+
+def test_interval_of_two_seeds_is_what_lies_between_and_of_one_there_is_none():
+    assert plot.over_seeds([1.0, 5.0]) == (3, 1, 5)
+    middle, *interval = plot.over_seeds([4.0], [1.0, 2.0], signs=(1, -1))
+    assert middle == 2.5 and np.isnan(interval).all()
+    assert plot.shown((2.5, *interval)) == "2.5"
+
+
+def test_interval_of_a_difference_is_that_of_all_resamples():
+    """Of three seeds against three, by enumeration of all 27 × 27 pairs of resamples."""
+    a, b = np.array([3.0, 7, 8]), np.array([1.0, 2, 4])
+    found = plot.over_seeds(list(a), list(b), signs=(1, -1))
+    means = [np.array([*itertools.product(x, repeat=3)]).mean(1) for x in (a, b)]
+    every = np.subtract.outer(*means).ravel()
+    assert found[0] == pytest.approx(a.mean() - b.mean())
+    np.testing.assert_allclose(found[1:], np.quantile(every, [0.025, 0.975]), atol=0.35)
+
+
+def test_score_is_the_mean_evaluation_of_the_last_fifth():
+    steps = 5000.0 * np.arange(1, 21)
+    run = {"env_steps": steps, "eval_return": np.arange(20.0), "coverage": np.arange(20.0)}
+    assert plot.score(run, 100_000) == pytest.approx(np.mean([15, 16, 17, 18, 19]))
+    assert plot.score(run, 50_000) == pytest.approx(
+        np.mean([7, 7.5, 8, 8.5, 9])
+    )  # 40,000 to 50,000
+    assert plot.covered(run, 50_000) == np.mean(np.arange(10))
+    late = run | {"env_steps": steps + 1}
+    assert plot.covered(late, 50_000) == np.mean(np.arange(10))
+    assert plot.score({k: v[:1] for k, v in run.items()}, 5000) == 0
+
+
+@pytest.mark.parametrize("low, high, lies, expected", [
+    (1, 9, "above", SUPPORTED), (-9, -1, "above", REFUTED), (-1, 1, "above", OPEN),
+    (-4, 4, "within", SUPPORTED), (6, 9, "within", REFUTED), (-9, -6, "within", REFUTED),
+    (-4, 9, "within", OPEN), (-99, 4, "not above", SUPPORTED), (6, 9, "not above", REFUTED),
+    (4, 6, "not above", OPEN), (np.nan, np.nan, "above", OPEN), (np.nan, np.nan, "within", OPEN),
+])  # fmt: skip
+def test_verdicts_of_intervals_with_a_margin_of_five(low, high, lies, expected):
+    assert claims.verdict(low, high, lies, 5) == expected
+
+
+def made_up(**returns) -> dict:
+    """{env: {label: {seed: run}}} of final returns by arm, in all four robots."""
+    steps = np.array([50_000.0, 100_000.0])
+    arms = {
+        name.replace("_", "-"): {
+            str(k): {"env_steps": steps, "eval_return": np.full(2, r), "coverage": np.full(2, r)}
+            for k, r in enumerate(of)
+        }
+        for name, of in returns.items()
+    }
+    return {f"{robot}BulletEnv-v0": dict(arms) for robot in claims.ROBOTS}
+
+
+def judged(runs: dict) -> list[str]:
+    """The verdict on each claim."""
+    reference = plot.read_reference()
+    common = claims.shared_changes(runs)[0]
+    return [claims.judge(groups, runs, common, reference)[0] for groups in claims.CLAIMS.values()]
+
+
+def test_claims_of_made_up_runs():
+    """All as the paper says but for Ant (3) and the majority (5), then all as it says of Ant: the
+    same returns on all robots cannot be both."""
+    runs = made_up(
+        dreamer=[1.0, 2, 3], dreamer_maxent=[980.0, 985, 990], revised=[950.0, 960, 970],
+        maxent=[990.0, 995, 999],
+    )  # fmt: skip
+    assert judged(runs)[:5] == [SUPPORTED, SUPPORTED, REFUTED, SUPPORTED, REFUTED]
+    explored = made_up(
+        dreamer=[500.0, 505, 510], dreamer_maxent=[980.0, 985, 990], revised=[505.0, 508, 512],
+        maxent=[990.0, 995, 999],
+    )  # fmt: skip
+    assert judged(explored)[:5] == [REFUTED, OPEN, SUPPORTED, REFUTED, SUPPORTED]
+
+
+def test_two_seeds_are_not_enough_and_what_is_missing_is_named(capsys):
+    runs = made_up(dreamer=[1.0, 2], revised=[950.0, 960])
+    assert set(judged(runs)) == {OPEN}
+    text = claims.report(runs, plot.read_reference())
+    assert "| no maxent |" in text and "| no dreamer-maxent |" in text
+    assert "| Hopper | revised − dreamer: above 0 | 953.5 [948.0, 959.0] | 2, 2 | 100,000 |" in text
+
+
+def test_runs_are_held_against_those_of_the_same_settings():
+    """An arm run with other settings is no opponent; both with the same ones are."""
+    runs = made_up(dreamer=[1.0, 2, 3], revised=[4.0, 5, 6])
+    for arms in runs.values():
+        arms["revised, batch_size 10"] = arms.pop("revised")
+    assert claims.shared_changes(runs) == []
+    assert "no revised" in claims.report(runs, plot.read_reference())
+    for arms in runs.values():
+        arms["dreamer, batch_size 10"] = arms.pop("dreamer")
+    assert claims.shared_changes(runs) == [{"batch_size 10"}]
+
+
+def test_coverage_at_equal_noise_finds_its_runs():
+    runs = made_up(maxent=[7.0, 8, 9], revised=[1.0, 2, 3])
+    for arms in runs.values():
+        arms["revised, action_noise 0.0"] = arms["revised"]
+    assert judged(runs)[5] == SUPPORTED
+
+
+def test_folders_are_judged_and_bad_ones_end_with_one_sentence(tmp_path, capsys):
+    assert claims.main([str(tmp_path)]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    for seed in range(3):
+        folder = tmp_path / f"run{seed}"
+        folder.mkdir()
+        settings = dataclasses.asdict(dataclasses.replace(default_settings("dreamer"), seed=seed))
+        (folder / "settings.json").write_text(json.dumps(settings))
+        columns = "env_steps,wall_seconds,eval_return,eval_interval95,eval_length,coverage"
+        (folder / "metrics.csv").write_text(f"{columns}\n5000,60,{10 + seed},1,9,2.5\n")
+    assert claims.main([str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert "With the usual settings" in said and "| 5,000 | supported |" in said
+
+
+def test_coverage_beside_the_entropy_estimate_is_a_line_a_run():
+    """ρ is Spearman's, nan left out; nothing is drawn of runs without an estimate."""
+    axes = plot.plt.figure().subplots()
+    run = {"coverage": np.array([1.0, 2, 3, 9]), "mdn/entropy": np.array([5.0, 7, 6, np.nan])}
+    plot.draw_against(axes, {"0": run}, "maxent", "C0")
+    rho = stats.spearmanr([5, 7, 6], [1, 2, 3]).statistic
+    assert [text for text in axes.get_legend_handles_labels()[1]] == [f"maxent: ρ {rho:.2f}"]
+    assert axes.lines[0].get_ydata().tolist() == [1, 2, 3]
+    plot.draw_against(axes, {"0": {"coverage": run["coverage"]}}, "revised", "C1")
+    assert len(axes.get_legend_handles_labels()[1]) == 1
+    plot.plt.close("all")
