@@ -189,7 +189,7 @@ def play(agent, env, policy: Callable, seed: int, most: int = 10_000) -> Episode
     image, _ = env.reset(seed=seed)
     images, actions, states = [image], [np.zeros(env.action_space.shape, np.float32)], [None]
     rewards, over, length = [], False, 0
-    with torch.random.fork_rng():
+    with torch.random.fork_rng([agent.device] if agent.device.type == "cuda" else []):
         torch.manual_seed(seed)
         while not over and length < most:
             action, state = act(agent, policy, images[-1], actions[-1], states[-1])

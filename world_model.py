@@ -50,8 +50,9 @@ class Dream(NamedTuple):
 
 
 def in_slices(function: Callable[..., Tensor], *inputs: Tensor) -> Tensor:
-    """function(*inputs), computed for `SLICE` rows of the inputs at a time."""
-    parts = zip(*(x.split(SLICE) for x in inputs), strict=True)
+    """function(*inputs), computed on a CPU for `SLICE` rows of the inputs at a time."""
+    rows = SLICE if inputs[0].is_cpu else len(inputs[0])
+    parts = zip(*(x.split(rows) for x in inputs), strict=True)
     return torch.cat([function(*part) for part in parts])
 
 
@@ -105,12 +106,14 @@ class TransposedConvolution(torch.autograd.Function):
 
 
 class TransposedConv2d(nn.ConvTranspose2d):
-    """`nn.ConvTranspose2d` of stride 2 by the function above, in the precision of its input."""
+    """`nn.ConvTranspose2d` of stride 2, on a CPU by the function above in its input's precision."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int):
         super().__init__(inputs, outputs, kernel, stride=2)
 
     def forward(self, x: Tensor) -> Tensor:
+        if not x.is_cpu:
+            return super().forward(x)
         with torch.autocast(x.device.type, enabled=False):
             return TransposedConvolution.apply(x, self.weight.to(x.dtype), self.bias.to(x.dtype))
 
@@ -375,7 +378,8 @@ class WorldModel(nn.Module):
         to_prior = kl_divergence(posterior, prior).sum(-1)
         if not self.fixed_prior:
             return {"kl": masked_mean(to_prior, seen).clamp(min=self.free_nats)}
-        standard = Normal(torch.zeros_like(posterior.mean), torch.ones_like(posterior.stddev))
+        zeros = torch.zeros_like(posterior.mean)
+        standard = Normal(zeros, zeros + 1, validate_args=False)  # to check waits for the device
         jeffreys = to_prior + kl_divergence(prior, posterior).sum(-1)
         to_standard = kl_divergence(posterior, standard).sum(-1)
         return {
