@@ -191,7 +191,8 @@ def update(
         starts = starts[torch.randperm(len(starts))[: max(1, round(s.starts * len(starts)))]]
     for name in agent.actors:
         update_actor(agent, name, starts, beta, s, metrics, look)
-    return {name: value.item() for name, value in metrics.items()}
+    values = torch.stack([value.detach().float() for value in metrics.values()])
+    return dict(zip(metrics, values.tolist(), strict=True))  # a device is waited for once
 
 
 @torch.no_grad()
