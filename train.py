@@ -81,6 +81,7 @@ class Settings:
     floor_brightness: Share = 1.0  # factor on a PyBullet floor's texture; 1 is its own (ours)
 
     termination: bool = True  # §4.2: learn when episodes end, and let returns end there
+    absorbing: Annotated[int, Interval(ge=0, le=100)] = 0  # rows that repeat an end, with it (ours)
     observe_first: bool = True  # §4.2: see o_0 before choosing a_0 (Dreamer's code does too)
     fixed_prior: bool = True  # §4.2: KL to N(0, 1) and Jeffreys to the prior, not KL to the prior
     q_critic: bool = True  # §4.2 minor 1: the critic is Q(s, a), not V(s)
@@ -151,7 +152,8 @@ PRESETS = {
     "small": dict(  # sizes and cadence for two CPU cores, and what results/trials.md found to help
         deter=128, stoch=64, hidden=128, units=128, depth=16, batch_size=20, length=25,
         mdn_units=128, prefill=2000, starts=0.5, floor_brightness=0.4, reward_weight=20.0,
-        squared_reward=True, action_penalty=0.01, beta_share=True,
+        squared_reward=True, action_penalty=0.01, beta_share=True, overshoot=10, critic_lr=5e-4,
+        absorbing=5,
     ),
     "paper": dict(steps=1_000_000, train_every=1000, updates=100),
 }
@@ -296,6 +298,9 @@ def train(run: "Run", stop: Callable[[], bool]) -> None:
                 action = explore(action, s.action_noise, s.random_action, run.rng)
             image, reward, terminated, truncated, info = env.step(action)
             replay.add(image, action, reward, terminated)
+            for _ in range(s.absorbing if terminated and s.termination else 0):
+                anything = run.rng.uniform(-1, 1, action.shape)
+                replay.add(image, anything, 0.0, terminated)  # whatever is done there, it is over
             run.note_decision(action, terminated or truncated, info)
         else:
             if rank() == 0:
@@ -535,7 +540,7 @@ class Run:
         # A checkpoint needs its window of the ring whole until two more are written.
         capacity, self.unsaved = self.s.replay_capacity, min(500, self.s.replay_capacity)
         actions, file = self.env.action_space.shape[0], self.own / "replay.bin"
-        self.replay = Replay(capacity, actions, file, reserve=3 * self.unsaved)
+        self.replay = Replay(capacity, actions, file, reserve=3 * (self.unsaved + self.s.absorbing))
 
     def sign(self) -> None:
         """Say in the folder what its experiment is, and which process goes on with it."""
