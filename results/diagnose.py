@@ -37,6 +37,7 @@ DECISIONS = "decisions"
 SIGMA = "σ of the explorer before its tanh (5 at first)"
 ENDS = "ends of episodes that happened"
 EXPECTED = "ends of episodes that the model expected"
+OUTLIVED = "chance to outlive, in dreams from up to 15 decisions before, an end that came"
 PROMISED = "discounted return that the model promised"
 EARNED = "discounted return that then happened"
 AFTER = f"rewards, R² after {OPEN_LOOP} steps without images"
@@ -96,6 +97,7 @@ def measure(agent: Agent, name: str, episode: Episode) -> dict[str, np.ndarray]:
     Returns, beside what `follow` does:
         reward, terminated, return: (M, 2) predicted and real, of each row; returns only where
         the real one is known, which in an episode cut off by a time limit is long before its end.
+        outlived: (at most H,) chance that a dream outlives the end, begun so far before it.
         seen_image: (L,) squared error of a pixel of an image that is seen: its reconstruction.
         saturated: (L, A) whether an action is within 0.01 of its bound.
         greedy, sigma: (L, A) the actor's mode in each state, and the explorer's σ.
@@ -119,6 +121,10 @@ def measure(agent: Agent, name: str, episode: Episode) -> dict[str, np.ndarray]:
         "return": (believed[known], discounted(rewards, s.gamma)[known]),
     }
     found = {key: np.stack([p.cpu().numpy(), real], -1) for key, (p, real) in said.items()}
+    if episode.terminated:
+        left = torch.arange(min(len(rewards), s.horizon), 0, -1)
+        survival = dream.continues[:, -len(left) :].cumprod(0).cpu()
+        found["outlived"] = survival[left - 1, torch.arange(len(left))].numpy()
     found["saturated"] = np.abs(episode.actions) > 0.99
     found["greedy"] = actor.mode(states[:-1]).cpu().numpy()
     if hasattr(actor, "distribution"):
@@ -172,6 +178,8 @@ def figures(found: dict[str, np.ndarray], episodes: list[Episode]) -> dict[str, 
         named[BLIND] = np.corrcoef(found["alive"], reward[1] - reward[0])[0, 1]
     if "sigma" in found:
         named[SIGMA] = found["sigma"].mean()
+    if "outlived" in found:
+        named[OUTLIVED] = found["outlived"].mean()
     if returns.size:
         named |= {PROMISED: returns[0].mean(), EARNED: returns[1].mean()}
         named["returns, R² (below 0: worse than their mean)"] = r_squared(*returns)
@@ -259,6 +267,9 @@ VERDICTS = (
     # A single end may be of a rare kind.
     (lambda of: of[ENDS] >= 3 and of[EXPECTED] < 0.5 * of[ENDS],
      "the model does not see ends coming: weigh terminations more."),
+    # 0 if foreseen to the decision; one that is some decisions late leaves a third.
+    (lambda of: of[ENDS] >= 3 and of.get(OUTLIVED, 0) > 0.6,
+     "dreams outlive ends that came: nothing is feared; raise --absorbing or --overshoot."),
     # At 0.005 a decision, dreams lose half as much again of what is far off as by γ = 0.99.
     (lambda of: of[EXPECTED] > 2 * of[ENDS] + 0.005 * of[DECISIONS],
      "the model expects ends that do not come: nothing far off counts in its dreams."),

@@ -72,6 +72,19 @@ def test_each_prediction_stands_beside_what_happened_at_its_step():
     np.testing.assert_allclose(found["open_image"][1, 3, 1], still, rtol=1e-5)
 
 
+@pytest.mark.parametrize("length, steps", [(30, 5), (3, 3)])
+def test_dreams_outlive_an_end_by_all_the_decisions_before_it(length, steps):
+    """c is ½ everywhere: a dream begun k decisions before the end outlives it once in 2^k."""
+    agent = Agent(Settings(**TINY), actions=3, device=torch.device("cpu"), bfloat16=False)
+    agent.model.predict_continues = lambda state: torch.full(state.shape[:-1], 0.5)
+    episode = made_up_episode(length, terminated=True)
+    found = diagnose.measure(agent, "deterministic", episode)
+    assert found["outlived"].tolist() == [0.5**k for k in range(steps, 0, -1)]
+    assert diagnose.figures(found, [episode])[diagnose.OUTLIVED] == found["outlived"].mean()
+    cut_off = diagnose.measure(agent, "deterministic", made_up_episode(length, terminated=False))
+    assert "outlived" not in cut_off
+
+
 def test_open_loop_follows_the_actions_taken():
     torch.manual_seed(0)
     agent = Agent(Settings(**TINY), actions=3, device=torch.device("cpu"), bfloat16=False)
@@ -181,6 +194,8 @@ GOOD = {
     ({diagnose.REWARDS: 0.1}, "does not know the rewards"),
     ({diagnose.DEVIATION: 0.01, diagnose.REWARDS: -7}, "the same whatever it sees"),
     ({diagnose.EXPECTED: 1}, "see ends coming"),
+    ({diagnose.OUTLIVED: 0.7}, "outlive ends"),
+    ({diagnose.OUTLIVED: 0.7, diagnose.ENDS: 1, diagnose.EXPECTED: 1}, "Nothing stands out"),
     ({diagnose.EXPECTED: 30}, "do not come"),
     ({diagnose.EXPECTED: 3, diagnose.ENDS: 0}, "do not come"),  # of 500
     ({diagnose.EXPECTED: 3, diagnose.ENDS: 0, diagnose.DECISIONS: 2500}, "Nothing stands out"),
