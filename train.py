@@ -935,7 +935,7 @@ def train_run(run: Run) -> int:
     disk = rows * run.replay.dtype.itemsize / 1e9
     what = f"{s.env}, arm {s.arm}, preset {s.preset}, seed {s.seed}, from step {run.step:,}"
     print(f"{what}: {run.folder}\n{size:.1f} M parameters; {run.machine}; the replay will take "
-          f"{disk:.1f} GB of disk", flush=True)  # fmt: skip
+          f"some {disk:.1f} GB of disk", flush=True)  # fmt: skip
     launcher = ["torchrun", "--nproc-per-node", os.environ.get("LOCAL_WORLD_SIZE", "1")]
     launcher = launcher if dist.is_initialized() else [sys.executable]
     resume = "Go on with: " + shlex.join([*launcher, __file__, "--resume", str(run.folder)])
