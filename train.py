@@ -194,7 +194,7 @@ def update(
     for name in agent.actors:
         update_actor(agent, name, starts, beta, s, metrics, look)
     values = torch.stack([value.detach().float() for value in metrics.values()])
-    return dict(zip(metrics, values.tolist(), strict=True))  # a device is waited for once
+    return dict(zip(metrics, values.tolist(), strict=True))  # one wait for all
 
 
 @torch.no_grad()
@@ -821,14 +821,19 @@ def check(text: str, where: str = "") -> Settings:
         raise ValueError(f"{where}{wrong['msg']}.") from None
     n, least = processes(), s.prefill + s.train_every
     rows = s.prefill // s.action_repeat // n
-    few = s.density == "knn" and s.starts * s.batch_size * (s.length // 2) < 4 * n
+    ends = s.absorbing + 1 if s.termination else 1  # rows in which nothing is left to do, at most
+    live = s.starts * s.batch_size * (s.length // (ends + 1))
     for possible, sentence in (
         (s.batch_size % n == 0, f"--batch-size {s.batch_size} is no multiple of {n} processes"),
         (s.length <= rows, f"--prefill {s.prefill} makes {rows} rows, no --length {s.length}"),
         (s.length <= s.replay_capacity, f"--replay-capacity is less than --length {s.length}"),
         (s.steps >= least, f"--steps {s.steps} leaves no update after --prefill: give {least}"),
         (s.eval_every >= s.train_every, f"--eval-every is less than --train-every {s.train_every}"),
-        (not few, "--density knn needs four states to dream from: raise --batch-size or --length"),
+        (s.length > ends, f"--length {s.length} may hold nothing but an end: give {ends + 1}"),
+        (
+            s.density != "knn" or live >= 4 * n,
+            "--density knn dreams from 4 states: raise --batch-size",
+        ),
     ):
         if not possible:
             raise ValueError(f"{where}{sentence}.")

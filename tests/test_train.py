@@ -358,6 +358,7 @@ BAD = {
     "--resume nowhere": "nowhere",
     "--resume nowhere --steps 7": "nowhere",
     "--horizon 1000000": "--horizon",
+    "--absorbing 24": "--length",
     "--density knn --batch-size 1 --length 7": "--batch-size",
     "--density gauss": "knn",
     "--updates 1000000000": "--updates",
