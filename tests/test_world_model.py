@@ -486,28 +486,34 @@ def test_rewards_keep_their_digits_in_bfloat16():
     torch.testing.assert_close(reward, torch.full((5,), 150.3))
 
 
-def test_terms_ahead_are_those_of_a_hand_rolled_dream_along_the_recorded_actions():
-    model, batch = make_model(overshoot=5), make_batch()
+@pytest.mark.parametrize("steps", [2, 5])
+def test_terms_ahead_are_those_of_a_hand_rolled_dream_along_the_recorded_actions(steps):
+    model, batch = make_model(overshoot=steps), make_batch()
     state = loss(model, batch)[1].detach()
     torch.manual_seed(3)
     terms = model.ahead(state, batch)
     torch.manual_seed(3)
-    torch.randint(1, (3,))  # all six rows are needed: the dream can begin at the first alone
-    deter, stoch = state[:, 0].split([DETER, STOCH], -1)
+    begin = torch.randint(6 - steps, (3,)).tolist()
+    assert steps == 5 or len(set(begin)) > 1
+    now = torch.stack([state[b, begin[b]] for b in range(3)])
     reward, termination, count = 0.0, 0.0, 0
-    for t in range(1, 6):
-        deter = model.recur(deter, stoch, model.dense_action(batch["action"][:, t]))
-        stoch = world_model.normal(model.prior_net(deter)).rsample()
-        s = torch.cat([deter, stoch], -1)
+    for k in range(1, steps + 1):
+        action = torch.stack([batch["action"][b, begin[b] + k] for b in range(3)])
+        deter, stoch = now.split([DETER, STOCH], -1)
+        deter = model.recur(deter, stoch, model.dense_action(action))
+        now = torch.cat([deter, world_model.normal(model.prior_net(deter)).rsample()], -1)
         for b in range(3):
-            if not (b == 1 and t >= 3):  # there the second sequence is in another episode
-                error, d = (
-                    model.predict_reward(s[b]) - batch["reward"][b, t],
-                    model.termination(s[b]),
-                )
-                reward += F.smooth_l1_loss(error, torch.zeros(()))
-                p = torch.sigmoid(d if batch["terminated"][b, t] else -d)
-                termination, count = termination - p.log().squeeze(), count + 1
+            t = begin[b] + k
+            if batch["is_first"][b, begin[b] + 1 : t + 1].any():
+                continue  # there the sequence is in another episode
+            error, d = (
+                model.predict_reward(now[b]) - batch["reward"][b, t],
+                model.termination(now[b]),
+            )
+            reward += F.smooth_l1_loss(error, torch.zeros(()))
+            p = torch.sigmoid(d if batch["terminated"][b, t] else -d)
+            termination, count = termination - p.log().squeeze(), count + 1
+    assert steps == 2 or count < 15
     torch.testing.assert_close(terms["reward"], reward / count)
     torch.testing.assert_close(terms["termination"], termination / count)
 
