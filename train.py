@@ -223,13 +223,8 @@ def update_actor(
         returns = imagined_returns(dream, critic, s.gamma, s.lam)
         terms = {"return": actor_loss(returns, dream.continues, s.first_state_only)}
         if explores:
-            if s.density == "knn":  # on z alone: h has no scale of its own
-                bonus = particle_entropy(dream.state[..., s.deter :], dream.continues, s.gamma_q)
-            else:
-                bonus = entropy(agent.target_mdn, dream.state, dream.continues, s.gamma_q)
-            bonus = bonus.mean()
-            metrics["mdn/entropy"] = bonus
-            terms["entropy"] = -bonus
+            metrics["mdn/entropy"] = future_entropy(agent, dream)
+            terms["entropy"] = -metrics["mdn/entropy"]
         if look and explores:
             measure_gradients(agent, actor, terms, beta, metrics, len(starts))
         loss = terms["return"] + s.action_penalty * actor.raw(starts).square().sum(-1).mean()
@@ -250,6 +245,14 @@ def update_actor(
         metrics["mdn/nll"] = loss
         agent.step("mdn", loss, metrics, len(starts))
         soft_update(agent.target_mdn, agent.mdn, s.target_rate)
+
+
+def future_entropy(agent: "Agent", dream) -> Tensor:
+    """Ĥ of Eq. (7), the mean over a dream's starts: by the MDN, or by neighbours (`density`)."""
+    s = agent.s
+    if s.density == "knn":  # on z alone: h has no scale of its own
+        return particle_entropy(dream.state[..., s.deter :], dream.continues, s.gamma_q).mean()
+    return entropy(agent.target_mdn, dream.state, dream.continues, s.gamma_q).mean()
 
 
 def measure_gradients(
@@ -332,8 +335,8 @@ def beta_at(step: int, s: Settings) -> float:
 
 
 def evaluate(agent: "Agent", env, s: Settings, show=lambda text: None) -> list[Episode]:
-    """Totals and lengths of this process's share of episodes of the evaluated actor's mode, each
-    with a seed of its own, always the same. One in which the environment fails is left out."""
+    """This process's share of the episodes of the evaluated actor's mode, each with a seed of its
+    own, always the same. One in which the environment fails is left out."""
     episodes = []
     for k in range(rank(), s.eval_episodes, processes()):
         show(f"evaluating, episode {k + 1} of {s.eval_episodes}")
@@ -822,7 +825,8 @@ def check(text: str, where: str = "") -> Settings:
     n, least = processes(), s.prefill + s.train_every
     rows = s.prefill // s.action_repeat // n
     ends = s.absorbing + 1 if s.termination else 1  # rows in which nothing is left to do, at most
-    live = s.starts * s.batch_size * (s.length // (ends + 1))
+    live = s.starts * s.batch_size * (s.length // (ends + 1)) / n  # states to dream from, at least
+    enough = s.density != "knn" or live >= 4
     for possible, sentence in (
         (s.batch_size % n == 0, f"--batch-size {s.batch_size} is no multiple of {n} processes"),
         (s.length <= rows, f"--prefill {s.prefill} makes {rows} rows, no --length {s.length}"),
@@ -830,10 +834,7 @@ def check(text: str, where: str = "") -> Settings:
         (s.steps >= least, f"--steps {s.steps} leaves no update after --prefill: give {least}"),
         (s.eval_every >= s.train_every, f"--eval-every is less than --train-every {s.train_every}"),
         (s.length > ends, f"--length {s.length} may hold nothing but an end: give {ends + 1}"),
-        (
-            s.density != "knn" or live >= 4 * n,
-            "--density knn dreams from 4 states: raise --batch-size",
-        ),
+        (enough, "--density knn needs four states to dream from: raise --batch-size or --length"),
     ):
         if not possible:
             raise ValueError(f"{where}{sentence}.")

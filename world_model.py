@@ -368,8 +368,8 @@ class WorldModel(nn.Module):
         action, reward, terminated, is_first = (
             batch[name][each, rows] for name in ("action", "reward", "terminated", "is_first")
         )
-        following = iter([*action[1:], action[-1]])
-        dream = self.imagine(state[each, begin], lambda _: next(following), steps, action[0])
+        taken = iter([*action, action[-1]])  # the last one is chosen, not taken
+        dream = self.imagine(state[each, begin], lambda _: next(taken), steps)
         within = (~is_first).float().cumprod(0)  # up to the next episode
         return self.arrivals(dream.state[1:], reward, terminated, within)
 

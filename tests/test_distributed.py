@@ -272,6 +272,14 @@ def uninterrupted(tmp_path_factory) -> Path:
     return folder
 
 
+def ends_as(other: Path, folder: Path, launcher: subprocess.Popen) -> str:
+    """Wait until a run has ended, with the metrics of the other: what it said on the way."""
+    _, errors = launcher.communicate(timeout=200)
+    assert launcher.returncode == 0, errors
+    assert metrics(folder) == metrics(other)
+    return errors
+
+
 def test_each_process_keeps_its_own_and_the_first_the_rest(uninterrupted):
     names = {path.name for path in uninterrupted.iterdir() if "tfevents" not in path.name}
     own = {"replay.bin", "checkpoint.pt", "checkpoint.previous.pt", "run.lock"}
@@ -293,10 +301,8 @@ def test_a_run_killed_in_one_process_and_restarted_equals_one_never_killed(unint
     wait_for(folder / "rank-1/checkpoint.previous.pt", launcher)
     time.sleep(0.5)
     os.kill(worker(launcher, 1), signal.SIGKILL)
-    _, errors = launcher.communicate(timeout=200)
-    assert launcher.returncode == 0, errors
+    errors = ends_as(uninterrupted, folder, launcher)
     assert "Another process of this run has ended" in errors and "Traceback" not in errors
-    assert metrics(folder) == metrics(uninterrupted)
 
 
 @pytest.mark.slow
@@ -313,9 +319,7 @@ def test_a_process_one_checkpoint_behind_the_other_is_waited_for(uninterrupted, 
     wait_for(folder / "rank-1/checkpoint.pt", launcher)
     previous = torch.load(folder / "checkpoint.previous.pt")["kept"]["step"]
     assert previous != newest or launcher.poll() is not None  # what was passed over is gone
-    _, errors = launcher.communicate(timeout=200)
-    assert launcher.returncode == 0, errors
-    assert metrics(folder) == metrics(uninterrupted)
+    ends_as(uninterrupted, folder, launcher)
 
 
 @pytest.mark.slow
@@ -329,9 +333,7 @@ def test_ctrl_c_saves_in_all_processes_and_says_how_to_go_on(uninterrupted, tmp_
     kept = [read["kept"]["step"] for read in map(torch.load, folder.rglob("checkpoint.pt"))]
     assert len(kept) == 2 and kept[0] == kept[1]
     launcher = torchrun("--resume", folder)
-    _, errors = launcher.communicate(timeout=200)
-    assert launcher.returncode == 0, errors
-    assert metrics(folder) == metrics(uninterrupted)
+    ends_as(uninterrupted, folder, launcher)
 
 
 @pytest.mark.parametrize(

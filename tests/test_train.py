@@ -98,7 +98,8 @@ def test_the_end_of_an_episode_is_repeated_with_any_action_and_no_reward(switch,
     assert len(ends) > 2
     for i in ends[:-1]:  # the last may be the run's
         same = rows[i : i + copies + 1]
-        assert same["terminated"].all() and rows["is_first"][i + copies + 1]
+        assert same["terminated"].all() and not same["is_first"].any()
+        assert rows["is_first"][i + copies + 1] and same["reward"][0]  # the end has its own
         assert (same["image"] == rows["image"][i]).all() and not same["reward"][1:].any()
         assert len(np.unique(same["action"], axis=0)) == copies + 1
 
@@ -242,7 +243,7 @@ def test_a_run_whose_replay_has_wrapped_around_can_be_resumed(tmp_path):
     folder = tmp_path / "run"
     process = start("--run-dir", folder, *ring)
     rows = 0
-    while rows <= 100:  # the ring holds 80: what is sampled, and three times that in reserve
+    while rows <= 110:  # the ring holds 95: the 20 that are sampled, three times 20 + 5 in reserve
         time.sleep(0.01)
         if written(folder):
             rows = read_checkpoint(folder)[1]["kept"]["saved_rows"]
