@@ -73,9 +73,9 @@ class DeterministicActor(nn.Module):
 class QCritic(nn.Module):
     """Q(s, a) of the current policy, Eq. (2); minor modification 1 of §4.2."""
 
-    def __init__(self, size: int, actions: int, units: int, layers: int = 3):
+    def __init__(self, size: int, actions: int, units: int, layers: int = 3, norm=False):
         super().__init__()
-        self.net = mlp(size + actions, units, layers, 1)
+        self.net = mlp(size + actions, units, layers, 1, norm)
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """(…, D), (…, A) -> (…). At a ~ π(s): a one-sample estimate of V(s) = E_a Q(s, a)."""
@@ -85,9 +85,9 @@ class QCritic(nn.Module):
 class VCritic(nn.Module):
     """V(s) of the current policy, Eq. (1): the critic of the original Dreamer."""
 
-    def __init__(self, size: int, units: int, layers: int = 3):
+    def __init__(self, size: int, units: int, layers: int = 3, norm=False):
         super().__init__()
-        self.net = mlp(size, units, layers, 1)
+        self.net = mlp(size, units, layers, 1, norm)
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """(…, D), (…, A) -> (…). V ignores the action: either critic can stand in the loop."""

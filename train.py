@@ -122,6 +122,7 @@ class Settings:
     model_lr: Amount = 6e-4  # Adam's learning rate of the world model (Dreamer)
     actor_lr: Amount = 8e-5  # of each actor (Dreamer)
     critic_lr: Amount = 8e-5  # of each critic (Dreamer)
+    critic_norm: bool = False  # LayerNorm in critics, whose values else may run away (ours)
     mdn_lr: Amount = 2e-4  # of the mixture density network (§5)
     grad_clip: Amount = 100.0  # largest global gradient norm of an optimiser step (Dreamer)
     overshoot: Annotated[int, Interval(ge=0, le=1000)] = 0  # steps ahead that rewards learn (ours)
@@ -153,7 +154,7 @@ PRESETS = {
         deter=128, stoch=64, hidden=128, units=128, depth=16, batch_size=20, length=25,
         mdn_units=128, prefill=2000, starts=0.5, floor_brightness=0.4, reward_weight=20.0,
         squared_reward=True, action_penalty=0.01, beta_share=True, overshoot=10, critic_lr=5e-4,
-        absorbing=5,
+        absorbing=5, critic_norm=True, actor_lr=2e-4,
     ),
     "paper": dict(steps=1_000_000, train_every=1000, updates=100),
 }
@@ -378,9 +379,9 @@ class Agent(nn.Module):
         learners = {"model": (self.model, s.model_lr)}
         for name, actor in self.actors.items():
             if s.q_critic:
-                critic = actors.QCritic(size, actions, s.units)
+                critic = actors.QCritic(size, actions, s.units, norm=s.critic_norm)
             else:
-                critic = actors.VCritic(size, s.units)
+                critic = actors.VCritic(size, s.units, norm=s.critic_norm)
             self.critics[name] = critic
             learners[f"{name}_actor"] = actor, s.actor_lr
             learners[f"{name}_critic"] = critic, s.critic_lr

@@ -170,10 +170,12 @@ class Float32Linear(nn.Linear):
             return super().forward(x.float())
 
 
-def mlp(inputs: int, units: int, layers: int, outputs: int) -> nn.Sequential:
-    """`layers` hidden ELU layers of `units`, then a linear one, as in Dreamer."""
-    sizes = [inputs] + [units] * layers
-    hidden = [m for i, o in pairwise(sizes) for m in (nn.Linear(i, o), nn.ELU(inplace=True))]
+def mlp(inputs: int, units: int, layers: int, outputs: int, norm=False) -> nn.Sequential:
+    """`layers` hidden ELU layers of `units`, then a linear one, as in Dreamer; with `norm` each
+    after LayerNorm, so that no output grows with the size of its input."""
+    sizes, hidden = [inputs] + [units] * layers, []
+    for i, o in pairwise(sizes):
+        hidden += [nn.Linear(i, o), *([nn.LayerNorm(o)] if norm else []), nn.ELU(inplace=True)]
     return nn.Sequential(*hidden, Float32Linear(sizes[-1], outputs))
 
 

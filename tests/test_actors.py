@@ -1,6 +1,7 @@
 """actors.py held against torch.distributions, scipy and numbers worked by hand."""
 
 import math
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -265,6 +266,17 @@ def test_random_actions_are_uniform_and_as_frequent_as_asked():
     assert stats.kstest(got, stats.uniform(-1, 2).cdf).pvalue > 0.001
     count = sum(explore(np.zeros(2), 0.0, 0.3, rng).any() for _ in range(5000))
     assert stats.binomtest(int(count), 5000, 0.3).pvalue > 0.001
+
+
+@pytest.mark.parametrize("make", [partial(QCritic, 6, 2, 32), partial(VCritic, 6, 32)])
+def test_a_normalised_critic_does_not_run_away_with_the_size_of_its_state(make):
+    state, action = torch.randn(5, 6), torch.rand(5, 2)
+    growth = {}
+    for norm in (True, False):
+        critic = make(norm=norm)
+        growth[norm] = (critic(1e6 * state, action) / critic(1e3 * state, action)).abs()
+    torch.testing.assert_close(growth[True], torch.ones(5), rtol=0.1, atol=0)
+    assert growth[False].min() > 100
 
 
 @pytest.mark.parametrize("critic", [QCritic(6, 2, 8), VCritic(6, 8)])

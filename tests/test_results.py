@@ -15,6 +15,7 @@ from PIL import Image
 
 import results.baseline as baseline
 import results.diagnose as diagnose
+import results.frozen as frozen
 import results.play as play
 import results.plot as plot
 import results.reference as reference
@@ -246,6 +247,25 @@ def test_train_py_evaluates_by_it(trained, tmp_path, capfd):
 
 
 @pytest.mark.parametrize("actor", ["stochastic", "deterministic"])
+def test_fresh_actors_learn_in_a_model_that_stays_as_it_is(trained, actor, capsys, monkeypatch):
+    made, before = [], {path: path.read_bytes() for path in trained.iterdir() if path.is_file()}
+    make = frozen.frozen
+    monkeypatch.setattr(frozen, "frozen", lambda *a: made.append(make(*a)) or made[0])
+    brief = ["--updates", "3", "--every", "2", "--episodes", "1", "--actor", actor]
+    assert frozen.main([str(trained), *brief, "--no-critic-norm", "--horizon", "4"]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert len(said) == 1 and said[0].startswith("2 updates: promised ")
+    assert {path: path.read_bytes() for path in before} == before
+    (agent, replay), saved = made[0], torch.load(trained / "checkpoint.pt", weights_only=True)
+    assert (agent.s.horizon, agent.s.critic_norm, len(replay)) == (4, False, len(replay.rows))
+    now, actors = agent.state_dict(), [k for k in saved["agent"] if f"actors.{actor}" in k]
+    for name, value in saved["agent"].items():
+        if name.startswith("model."):
+            torch.testing.assert_close(now[name], value, rtol=0, atol=0)
+    assert not any(torch.equal(now[name], saved["agent"][name]) for name in actors)
+
+
+@pytest.mark.parametrize("actor", ["stochastic", "deterministic"])
 def test_one_episode_has_no_interval(trained, actor, capsys):
     assert play.main([str(trained), "--episodes", "1", "--actor", actor]) == 0
     said = capsys.readouterr().out
@@ -301,7 +321,7 @@ def test_a_film_keeps_real_time_and_its_colours(tmp_path):
 
 
 def test_bad_input_ends_with_one_sentence(tmp_path, capsys):
-    for program in (diagnose, play, plot):
+    for program in (diagnose, play, plot, frozen):
         assert program.main([str(tmp_path)]) == 2
         assert len(capsys.readouterr().err.strip().splitlines()) == 1
     for program in (diagnose, play):

@@ -1,0 +1,93 @@
+"""Is it the actors that hold a run back, or its world model? Fresh actors in a frozen model.
+
+    python results/frozen.py runs/NAME --horizon 15 --no-critic-norm
+
+takes a run's newest world model and its replay, leaves both as they are, and trains one actor and
+its critic from nothing in dreams of that model, under the run's settings or those given. Prints
+what the actor is promised and what it then earns. Settings that earn more in the same model are
+better for the actors; where all are promised more than they earn, the model is at fault, and only
+other experience mends it. The run is stopped, or may be going on.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import train
+from actors import play
+from env import EnvironmentFault, Replay, make_env
+from results.play import ACTORS
+
+
+def frozen(folder: Path, s: train.Settings, seed: int) -> tuple[train.Agent, Replay]:
+    """An agent with the world model of a run and all else anew, and the run's replay, in memory.
+    A ValueError, in one sentence, if the model of these settings is another."""
+    saved = train.read_checkpoint(folder)[1]
+    env = make_env(s.env, s.action_repeat, s.camera_distance, s.floor_brightness)
+    torch.manual_seed(seed)
+    agent = train.make_agent(s, env, "cpu", "auto")
+    weights = {k.removeprefix("model."): v for k, v in saved["agent"].items() if "model." in k}
+    try:
+        agent.model.load_state_dict(weights)
+    except RuntimeError as error:
+        raise ValueError(f"Another model was saved: {' '.join(str(error).split())}") from None
+    actions = env.action_space.shape[0]
+    rows = np.fromfile(folder / "replay.bin", Replay(0, actions).dtype)
+    replay = Replay(min(len(rows), saved["kept"]["saved_rows"]), actions)
+    replay.rows, replay.added = rows[: replay.capacity], replay.capacity
+    return agent, replay
+
+
+def learn(command: argparse.Namespace, s: train.Settings) -> None:
+    """Trains an actor, and prints a line each `every` updates."""
+    agent, replay = frozen(command.folder, s, command.seed)
+    name, rng, promised = command.actor, np.random.default_rng(command.seed), []
+    env = make_env(s.env, s.action_repeat, s.camera_distance, s.floor_brightness)
+    for updates in range(1, command.updates + 1):
+        batch = train.to_tensors(replay.sample(s.batch_size, s.length, rng), agent.device)
+        with torch.no_grad(), agent.autocast():
+            seen = agent.model.observe(batch["image"], batch["action"], batch["is_first"])
+        starts = seen.state[~batch["terminated"]]
+        starts = starts[torch.randperm(len(starts))[: max(1, round(s.starts * len(starts)))]]
+        train.update_actor(agent, name, starts, s.beta_start, s, metrics := {}, updates % 50 == 1)
+        promised.append(metrics[f"{name}_actor/return"].item())
+        if updates % command.every == 0:
+            policy, seeds = agent.actors[name].mode, range(command.episodes)
+            episodes = [play(agent, env, policy, 2**31 - 1 - k, s.eval_max_steps) for k in seeds]
+            earned = " ".join(f"{e.total:.0f} ({e.length})" for e in episodes)
+            said = f"promised {np.mean(promised[-50:]):.1f}, discounted; earned {earned}"
+            print(f"{updates} updates: {said}", flush=True)
+
+
+def main(arguments: list[str]) -> int:
+    """Runs a command line. Returns the exit code: 0 done, 1 the environment failed, 2 bad input."""
+    parser = argparse.ArgumentParser(
+        prog="python results/frozen.py", description="Trains fresh actors in a run's frozen model.",
+        epilog="Any setting of train.py may follow, as in train.py --resume.", allow_abbrev=False,
+    )  # fmt: skip
+    add = parser.add_argument
+    add("folder", type=Path, help="a run's folder, runs/NAME, with its replay")
+    add("--updates", type=int, default=600, help="of the actor and its critic (%(default)s)")
+    add("--every", type=int, default=300, help="updates between two lines (%(default)s)")
+    add("--episodes", type=int, default=4, help="played for a line (%(default)s)")
+    add("--seed", type=int, default=0, help="of networks and dreams (%(default)s)")
+    add("--actor", choices=ACTORS, default="deterministic", help="which learns (%(default)s)")
+    try:
+        command, settings = parser.parse_known_args(arguments)
+        s = train.parse(["--resume", str(command.folder), *settings]).settings
+        if command.actor not in ("stochastic", "deterministic")[: 1 + s.deterministic_actor]:
+            raise ValueError(f"{command.folder} has no {command.actor} actor.")
+        learn(command, s)
+    except (ValueError, OSError, EnvironmentFault) as error:
+        print(error, file=sys.stderr)
+        return 1 if isinstance(error, EnvironmentFault) else 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.stdout, sys.stderr = train.Patient(sys.stdout), train.Patient(sys.stderr)
+    sys.exit(main(sys.argv[1:]))
