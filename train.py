@@ -234,8 +234,9 @@ def update_actor(
     metrics[f"{name}_actor/return"] = returns[0].mean()
     metrics[f"{name}_actor/saturated"] = (dream.action.abs() > 0.99).float().mean()
     metrics[f"{name}_actor/deviation"] = actor.mode(starts).detach().std(0).mean()  # over states
+    if name == "stochastic":
+        metrics["stochastic_actor/sigma"] = actor.distribution(starts).stddev.mean()
     agent.step(f"{name}_actor", loss, metrics, len(starts))
-
     with agent.autocast():
         loss = critic_loss(critic, dream, returns, s.smooth_l1)
     metrics[f"{name}_critic/loss"] = loss
