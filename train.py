@@ -154,7 +154,7 @@ PRESETS = {
         deter=128, stoch=64, hidden=128, units=128, depth=16, batch_size=20, length=25,
         mdn_units=128, prefill=2000, starts=0.5, floor_brightness=0.4, reward_weight=20.0,
         squared_reward=True, action_penalty=0.01, beta_share=True, overshoot=10, critic_lr=5e-4,
-        absorbing=5, critic_norm=True, actor_lr=2e-4,
+        absorbing=5, critic_norm=True, actor_lr=2e-4, horizon=10,
     ),
     "paper": dict(steps=1_000_000, train_every=1000, updates=100),
 }

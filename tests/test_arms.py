@@ -57,7 +57,7 @@ LEARNING = {
     "floor_brightness": (0.4, 1.0), "reward_weight": (20.0, 1.0), "squared_reward": (True, False),
     "action_penalty": (0.01, 0.0), "beta_share": (True, False), "starts": (0.5, 1.0),
     "overshoot": (10, 0), "critic_lr": (5e-4, 8e-5), "absorbing": (5, 0),
-    "critic_norm": (True, False), "actor_lr": (2e-4, 8e-5),
+    "critic_norm": (True, False), "actor_lr": (2e-4, 8e-5), "horizon": (10, 15),
 }  # fmt: skip
 ACTIONS = 2
 
