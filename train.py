@@ -189,9 +189,7 @@ def update(
     metrics = {f"model/{name}": term for name, term in terms.items()}
     metrics["reward_r2"] = reward_r2(agent, states, batch)
     agent.step("model", loss, metrics)
-    starts = states[~batch["terminated"]].detach()  # (N, D): where it is over nothing follows
-    if s.starts < 1:
-        starts = starts[torch.randperm(len(starts))[: max(1, round(s.starts * len(starts)))]]
+    starts = dream_starts(states, batch, s.starts)
     for name in agent.actors:
         update_actor(agent, name, starts, beta, s, metrics, look)
     values = torch.stack([value.detach().float() for value in metrics.values()])
@@ -205,6 +203,14 @@ def reward_r2(agent: "Agent", states: Tensor, batch: dict[str, Tensor]) -> Tenso
     reward = batch["reward"][arrived]
     error = agent.model.predict_reward(states[arrived]) - reward
     return 1 - error.square().mean() / reward.var(correction=0).clamp(min=1e-6)
+
+
+def dream_starts(states: Tensor, batch: dict[str, Tensor], share: float) -> Tensor:
+    """(N, D): a share of a batch's states (B, T, D), but for ends, where nothing follows."""
+    starts = states[~batch["terminated"]].detach()
+    if share == 1:
+        return starts
+    return starts[torch.randperm(len(starts))[: max(1, round(share * len(starts)))]]
 
 
 def update_actor(

@@ -23,16 +23,16 @@ from env import EnvironmentFault, Replay, make_env
 from results.play import ACTORS
 
 
-def frozen(folder: Path, s: train.Settings, seed: int) -> tuple[train.Agent, Replay]:
+def frozen(folder: Path, like: train.Command, seed: int) -> tuple[train.Agent, Replay]:
     """An agent with the world model of a run and all else anew, and the run's replay, in memory.
     A ValueError, in one sentence, if the model of these settings is another."""
-    saved = train.read_checkpoint(folder)[1]
+    s, saved = like.settings, train.read_checkpoint(folder)[1]
     env = make_env(s.env, s.action_repeat, s.camera_distance, s.floor_brightness)
     torch.manual_seed(seed)
-    agent = train.make_agent(s, env, "cpu", "auto")
-    weights = {k.removeprefix("model."): v for k, v in saved["agent"].items() if "model." in k}
+    agent = train.make_agent(s, env, like.device, like.precision)
+    of_model = (item for item in saved["agent"].items() if item[0].startswith("model."))
     try:
-        agent.model.load_state_dict(weights)
+        agent.model.load_state_dict({name.removeprefix("model."): x for name, x in of_model})
     except RuntimeError as error:
         raise ValueError(f"Another model was saved: {' '.join(str(error).split())}") from None
     actions = env.action_space.shape[0]
@@ -42,17 +42,16 @@ def frozen(folder: Path, s: train.Settings, seed: int) -> tuple[train.Agent, Rep
     return agent, replay
 
 
-def learn(command: argparse.Namespace, s: train.Settings) -> None:
-    """Trains an actor, and prints a line each `every` updates."""
-    agent, replay = frozen(command.folder, s, command.seed)
+def learn(command: argparse.Namespace, like: train.Command) -> None:
+    """Trains an actor as that run of train.py would, and prints a line each `every` updates."""
+    s, (agent, replay) = like.settings, frozen(command.folder, like, command.seed)
     name, rng, promised = command.actor, np.random.default_rng(command.seed), []
     env = make_env(s.env, s.action_repeat, s.camera_distance, s.floor_brightness)
     for updates in range(1, command.updates + 1):
         batch = train.to_tensors(replay.sample(s.batch_size, s.length, rng), agent.device)
         with torch.no_grad(), agent.autocast():
             seen = agent.model.observe(batch["image"], batch["action"], batch["is_first"])
-        starts = seen.state[~batch["terminated"]]
-        starts = starts[torch.randperm(len(starts))[: max(1, round(s.starts * len(starts)))]]
+        starts = train.dream_starts(seen.state, batch, s.starts)
         train.update_actor(agent, name, starts, s.beta_start, s, metrics := {}, updates % 50 == 1)
         promised.append(metrics[f"{name}_actor/return"].item())
         if updates % command.every == 0:
@@ -78,10 +77,12 @@ def main(arguments: list[str]) -> int:
     add("--actor", choices=ACTORS, default="deterministic", help="which learns (%(default)s)")
     try:
         command, settings = parser.parse_known_args(arguments)
-        s = train.parse(["--resume", str(command.folder), *settings]).settings
-        if command.actor not in ("stochastic", "deterministic")[: 1 + s.deterministic_actor]:
+        like = train.parse(["--resume", str(command.folder), *settings])
+        if min(command.updates, command.every, command.episodes) < 1:
+            raise ValueError("--updates, --every and --episodes are 1 at least.")
+        if command.actor not in ACTORS[: 1 + like.settings.deterministic_actor]:
             raise ValueError(f"{command.folder} has no {command.actor} actor.")
-        learn(command, s)
+        learn(command, like)
     except (ValueError, OSError, EnvironmentFault) as error:
         print(error, file=sys.stderr)
         return 1 if isinstance(error, EnvironmentFault) else 2

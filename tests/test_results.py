@@ -324,7 +324,8 @@ def test_bad_input_ends_with_one_sentence(tmp_path, capsys):
     for program in (diagnose, play, plot, frozen):
         assert program.main([str(tmp_path)]) == 2
         assert len(capsys.readouterr().err.strip().splitlines()) == 1
-    for program in (diagnose, play):
+    (tmp_path / "settings.json").write_text(default_settings().to_json())
+    for program in (diagnose, play, frozen):
         assert program.main([str(tmp_path), "--episodes", "0"]) == 2
         assert len(capsys.readouterr().err.strip().splitlines()) == 1
 
