@@ -400,7 +400,7 @@ def test_a_finished_run_can_be_made_longer_and_says_what_changed(stub_run, capsy
     assert train.main(["--resume", str(stub_run), "--steps", "180", "--actor-lr", "1e-5"]) == 0
     said = capsys.readouterr().err
     assert "steps: 180 in the place of 120" in said and "β" in said
-    assert "actor_lr: 1e-05 in the place of 8e-05" in said
+    assert "actor_lr: 1e-05 in the place of 0.0002" in said
     rows = metrics(stub_run)
     assert rows[: len(before)] == before and int(rows[-1]["env_steps"]) == 180
     assert json.loads((stub_run / "settings.json").read_text())["actor_lr"] == 1e-5
