@@ -21,8 +21,7 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from actors import Episode, imagined_returns, play
-from env import EnvironmentFault
-from results.play import command_line, load, open_loop, strip
+from results.play import command_line, exit_code, load, open_loop, strip
 from results.plot import read_metrics
 from train import Agent, Patient
 
@@ -321,16 +320,11 @@ def diagnose(command: argparse.Namespace) -> Path:
 
 
 def main(arguments: list[str]) -> int:
-    """Runs a command line. Returns the exit code: 0 done, 1 the environment failed, 2 bad input."""
+    """Runs a command line. Returns its `exit_code`."""
     says = "Holds what a run's model predicts against what happens in fresh episodes."
     parser = command_line("diagnose.py", says, episodes=5)
     mpl.use("Agg")
-    try:
-        print(diagnose(parser.parse_args(arguments)))
-    except (ValueError, OSError, EnvironmentFault) as error:
-        print(error, file=sys.stderr)
-        return 1 if isinstance(error, EnvironmentFault) else 2
-    return 0
+    return exit_code(lambda: print(diagnose(parser.parse_args(arguments))))
 
 
 if __name__ == "__main__":

@@ -13,40 +13,43 @@ import argparse
 import sys
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import train
 from actors import play
-from env import EnvironmentFault, Replay, make_env
-from results.play import ACTORS
+from env import Replay, make_env
+from results.play import ACTORS, exit_code, take
 
 
-def frozen(folder: Path, like: train.Command, seed: int) -> tuple[train.Agent, Replay]:
-    """An agent with the world model of a run and all else anew, and the run's replay, in memory.
-    A ValueError, in one sentence, if the model of these settings is another."""
+def frozen(folder: Path, like: train.Command, seed: int) -> tuple[gym.Env, train.Agent, Replay]:
+    """A run's environment, an agent with its world model and all else anew, and its replay, in
+    memory. A ValueError, in one sentence, if the model of these settings is another."""
     s, saved = like.settings, train.read_checkpoint(folder)[1]
     env = make_env(s.env, s.action_repeat, s.camera_distance, s.floor_brightness)
     torch.manual_seed(seed)
     agent = train.make_agent(s, env, like.device, like.precision)
     of_model = (item for item in saved["agent"].items() if item[0].startswith("model."))
-    try:
-        agent.model.load_state_dict({name.removeprefix("model."): x for name, x in of_model})
-    except RuntimeError as error:
-        raise ValueError(f"Another model was saved: {' '.join(str(error).split())}") from None
+    take(agent.model, {name.removeprefix("model."): x for name, x in of_model})
     actions = env.action_space.shape[0]
     rows = np.fromfile(folder / "replay.bin", Replay(0, actions).dtype)
     replay = Replay(min(len(rows), saved["kept"]["saved_rows"]), actions)
     replay.rows, replay.added = rows[: replay.capacity], replay.capacity
-    return agent, replay
+    return env, agent, replay
 
 
-def learn(command: argparse.Namespace, like: train.Command) -> None:
+def learn(command: argparse.Namespace, settings: list[str]) -> None:
     """Trains an actor as that run of train.py would, and prints a line each `every` updates."""
-    s, (agent, replay) = like.settings, frozen(command.folder, like, command.seed)
-    name, rng, promised = command.actor, np.random.default_rng(command.seed), []
-    env = make_env(s.env, s.action_repeat, s.camera_distance, s.floor_brightness)
+    if min(command.updates, command.every, command.episodes) < 1:
+        raise ValueError("--updates, --every and --episodes are 1 at least.")
+    like = train.parse(["--resume", str(command.folder), *settings])
+    s, name = like.settings, command.actor
+    if name not in ACTORS[: 1 + s.deterministic_actor]:
+        raise ValueError(f"{command.folder} has no {name} actor.")
+    env, agent, replay = frozen(command.folder, like, command.seed)
+    rng, promised = np.random.default_rng(command.seed), []
     for updates in range(1, command.updates + 1):
         batch = train.to_tensors(replay.sample(s.batch_size, s.length, rng), agent.device)
         with torch.no_grad(), agent.autocast():
@@ -63,7 +66,7 @@ def learn(command: argparse.Namespace, like: train.Command) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """Runs a command line. Returns the exit code: 0 done, 1 the environment failed, 2 bad input."""
+    """Runs a command line. Returns its `exit_code`."""
     parser = argparse.ArgumentParser(
         prog="python results/frozen.py", description="Trains fresh actors in a run's frozen model.",
         epilog="Any setting of train.py may follow, as in train.py --resume.", allow_abbrev=False,
@@ -75,18 +78,7 @@ def main(arguments: list[str]) -> int:
     add("--episodes", type=int, default=4, help="played for a line (%(default)s)")
     add("--seed", type=int, default=0, help="of networks and dreams (%(default)s)")
     add("--actor", choices=ACTORS, default="deterministic", help="which learns (%(default)s)")
-    try:
-        command, settings = parser.parse_known_args(arguments)
-        like = train.parse(["--resume", str(command.folder), *settings])
-        if min(command.updates, command.every, command.episodes) < 1:
-            raise ValueError("--updates, --every and --episodes are 1 at least.")
-        if command.actor not in ACTORS[: 1 + like.settings.deterministic_actor]:
-            raise ValueError(f"{command.folder} has no {command.actor} actor.")
-        learn(command, like)
-    except (ValueError, OSError, EnvironmentFault) as error:
-        print(error, file=sys.stderr)
-        return 1 if isinstance(error, EnvironmentFault) else 2
-    return 0
+    return exit_code(lambda: learn(*parser.parse_known_args(arguments)))
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ images; with --video as episode-STEP.gif too. The run may still be going on.
 
 import argparse
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -41,11 +42,16 @@ def load(folder: Path, checkpoint: str, device: str, precision: str):
             raise ValueError(f"{folder} was not evaluated yet: it has no best.pt.") from None
         except Exception as error:  # damage has many
             raise ValueError(f"{path} is damaged: {type(error).__name__}.") from None
+    take(agent, weights)
+    return s, env, agent, name
+
+
+def take(networks: torch.nn.Module, weights: dict[str, torch.Tensor]) -> None:
+    """Load what was saved. A ValueError, in one sentence, if it is of other networks."""
     try:
-        agent.load_state_dict(weights)
+        networks.load_state_dict(weights)
     except RuntimeError as error:
         raise ValueError(f"Other networks were saved: {' '.join(str(error).split())}") from None
-    return s, env, agent, name
 
 
 @torch.no_grad()
@@ -137,18 +143,23 @@ def command_line(program: str, says: str, episodes: int) -> argparse.ArgumentPar
     return parser
 
 
-def main(arguments: list[str]) -> int:
-    """Runs a command line. Returns the exit code: 0 done, 1 the environment failed, 2 bad input."""
-    parser = command_line("play.py", "Plays the networks of a run.", episodes=10)
-    add, which = parser.add_argument, "by its mode; evaluated: evaluations' own (%(default)s)"
-    add("--actor", choices=("evaluated", *ACTORS), default="evaluated", help=which)
-    add("--video", action="store_true", help="the best episode's beginning as an animated GIF")
+def exit_code(work: Callable[[], object]) -> int:
+    """Does it: 0 done, 1 the environment failed, 2 bad input; what was wrong, in one sentence."""
     try:
-        show(parser.parse_args(arguments))
+        work()
     except (ValueError, OSError, EnvironmentFault) as error:
         print(error, file=sys.stderr)
         return 1 if isinstance(error, EnvironmentFault) else 2
     return 0
+
+
+def main(arguments: list[str]) -> int:
+    """Runs a command line. Returns its `exit_code`."""
+    parser = command_line("play.py", "Plays the networks of a run.", episodes=10)
+    add, which = parser.add_argument, "by its mode; evaluated: evaluations' own (%(default)s)"
+    add("--actor", choices=("evaluated", *ACTORS), default="evaluated", help=which)
+    add("--video", action="store_true", help="the best episode's beginning as an animated GIF")
+    return exit_code(lambda: show(parser.parse_args(arguments)))
 
 
 if __name__ == "__main__":

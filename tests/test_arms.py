@@ -499,6 +499,25 @@ def test_action_penalty_draws_saturated_actions_back(name):
     assert (actor.raw(state) < before).all()
 
 
+@pytest.mark.parametrize("critic", [{}, {"q_critic": False}])
+@pytest.mark.parametrize("norm", [False, True])
+def test_critics_alone_are_normalised_where_asked(critic, norm):
+    agent = make_agent(tiny("maxent", critic_norm=norm, **critic))
+    normalised = {
+        name
+        for name, net in networks(agent).items()
+        if any(isinstance(module, torch.nn.LayerNorm) for module in net.modules())
+    }
+    assert normalised == ({"stochastic_critic", "deterministic_critic"} if norm else set())
+
+
+@pytest.mark.parametrize("arm", NAMES)
+def test_the_explorers_sigma_is_five_at_first(arm):
+    metrics = updated(tiny(arm))[1]
+    assert metrics["stochastic_actor/sigma"] == pytest.approx(5, rel=0.1)
+    assert "deterministic_actor/sigma" not in metrics
+
+
 def test_beta_share_gives_the_entropys_gradient_that_share_of_the_returns():
     s = tiny("maxent", beta_share=True)
     agent = make_agent(s)
