@@ -499,6 +499,18 @@ def average_over_processes(tensors: list[Tensor], count: int) -> None:
         x.copy_(mean.view_as(x))
 
 
+def unsaved(s: Settings) -> int:
+    """Rows of experience after which the next checkpoint is due."""
+    return min(500, s.replay_capacity)
+
+
+def replay_in(folder: Path, s: Settings, actions: int) -> Replay:
+    """A process's replay. A checkpoint needs its window of the ring whole until two more are
+    written."""
+    reserve = 3 * (unsaved(s) + s.absorbing)
+    return Replay(s.replay_capacity, actions, folder / "replay.bin", reserve)
+
+
 class Run:
     """All that a run is: environments, agent, replay, random states, counters, and its folder.
 
@@ -548,10 +560,7 @@ class Run:
         except filelock.Timeout:
             who = f"process {owner.read_text()}" if owner.exists() else "another process"
             raise ValueError(f"{self.folder} is in use by {who}: stop it or wait for it.") from None
-        # A checkpoint needs its window of the ring whole until two more are written.
-        capacity, self.unsaved = self.s.replay_capacity, min(500, self.s.replay_capacity)
-        actions, file = self.env.action_space.shape[0], self.own / "replay.bin"
-        self.replay = Replay(capacity, actions, file, reserve=3 * (self.unsaved + self.s.absorbing))
+        self.replay = replay_in(self.own, self.s, self.env.action_space.shape[0])
 
     def sign(self) -> None:
         """Say in the folder what its experiment is, and which process goes on with it."""
@@ -651,7 +660,7 @@ class Run:
     def save_if_due(self) -> None:
         """Write a checkpoint every `checkpoint_minutes`, and before the ring's reserve is full."""
         waited = time.monotonic() - self.clock >= 60 * self.s.checkpoint_minutes
-        if any(gathered(waited or self.replay.added - self.saved_rows >= self.unsaved)):
+        if any(gathered(waited or self.replay.added - self.saved_rows >= unsaved(self.s))):
             self.save()
 
     def save(self) -> None:

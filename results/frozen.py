@@ -23,25 +23,32 @@ from actors import play
 from env import Replay, make_env
 from results.play import ACTORS, exit_code, take
 
+EXPERIENCE = (  # settings of what was seen, which only the run itself could change
+    "env", "action_repeat", "camera_distance", "floor_brightness", "absorbing", "replay_capacity",
+)  # fmt: skip
+
 
 def frozen(folder: Path, like: train.Command, seed: int) -> tuple[gym.Env, train.Agent, Replay]:
-    """A run's environment, an agent with its world model and all else anew, and its replay, in
-    memory. A ValueError, in one sentence, if the model of these settings is another."""
-    s, saved = like.settings, train.read_checkpoint(folder)[1]
+    """A run's environment, an agent with its world model and all else anew, and its replay (of
+    several processes, the first one's). A ValueError, in one sentence, if these settings are of
+    another model or other experience."""
+    s, made = train.check(like.settings.to_json()), train.read_settings(folder)
+    if other := [name for name in EXPERIENCE if getattr(s, name) != getattr(made, name)]:
+        raise ValueError(f"{folder} has its own experience: leave out {', '.join(other)}.")
+    saved = train.read_checkpoint(folder)[1]
     env = make_env(s.env, s.action_repeat, s.camera_distance, s.floor_brightness)
     torch.manual_seed(seed)
     agent = train.make_agent(s, env, like.device, like.precision)
     of_model = (item for item in saved["agent"].items() if item[0].startswith("model."))
     take(agent.model, {name.removeprefix("model."): x for name, x in of_model})
-    actions = env.action_space.shape[0]
-    rows = np.fromfile(folder / "replay.bin", Replay(0, actions).dtype)
-    replay = Replay(min(len(rows), saved["kept"]["saved_rows"]), actions)
-    replay.rows, replay.added = rows[: replay.capacity], replay.capacity
+    replay = train.replay_in(folder, s, env.action_space.shape[0])
+    replay.restore(saved["kept"]["saved_rows"], saved["checksums"].numpy())
     return env, agent, replay
 
 
 def learn(command: argparse.Namespace, settings: list[str]) -> None:
-    """Trains an actor as that run of train.py would, and prints a line each `every` updates."""
+    """Trains an actor as that run of train.py would, with the β of its start, and prints a line
+    each `every` updates."""
     if min(command.updates, command.every, command.episodes) < 1:
         raise ValueError("--updates, --every and --episodes are 1 at least.")
     like = train.parse(["--resume", str(command.folder), *settings])

@@ -248,22 +248,47 @@ def test_train_py_evaluates_by_it(trained, tmp_path, capfd):
 
 @pytest.mark.parametrize("actor", ["stochastic", "deterministic"])
 def test_fresh_actors_learn_in_a_model_that_stays_as_it_is(trained, actor, capsys, monkeypatch):
-    made, before = [], {path: path.read_bytes() for path in trained.iterdir() if path.is_file()}
+    made, anew, before = (
+        [],
+        {},
+        {path: path.read_bytes() for path in trained.iterdir() if path.is_file()},
+    )
     make = frozen.frozen
-    monkeypatch.setattr(frozen, "frozen", lambda *a: made.append(make(*a)) or made[0])
+
+    def watched(*arguments):
+        made.extend(make(*arguments))
+        torch.manual_seed(0)
+        fresh = Agent(made[1].s, 3, torch.device("cpu"), made[1].bfloat16).state_dict()
+        anew.update({n: x.clone() for n, x in made[1].state_dict().items() if n[:5] != "model"})
+        assert all(torch.equal(value, fresh[name]) for name, value in anew.items())
+        return tuple(made)
+
+    monkeypatch.setattr(frozen, "frozen", watched)
     brief = ["--updates", "3", "--every", "2", "--episodes", "1", "--actor", actor]
     assert frozen.main([str(trained), *brief, "--no-critic-norm", "--horizon", "4"]) == 0
     said = capsys.readouterr().out.splitlines()
     assert len(said) == 1 and said[0].startswith("2 updates: promised ")
     assert {path: path.read_bytes() for path in before} == before
-    (_, agent, replay), saved = made[0], torch.load(trained / "checkpoint.pt", weights_only=True)
+    (_, agent, replay), saved = made, torch.load(trained / "checkpoint.pt", weights_only=True)
     assert (agent.s.horizon, agent.s.critic_norm) == (4, False)
-    assert len(replay) == len(replay.rows) == saved["kept"]["saved_rows"]
-    now, actors = agent.state_dict(), [k for k in saved["agent"] if f"actors.{actor}" in k]
+    assert replay.added == saved["kept"]["saved_rows"] and replay.capacity == 500_000
+    now = agent.state_dict()
     for name, value in saved["agent"].items():
         if name.startswith("model."):
             torch.testing.assert_close(now[name], value, rtol=0, atol=0)
-    assert not any(torch.equal(now[name], saved["agent"][name]) for name in actors)
+    learnt = {name.rpartition(".net.")[0] for name, x in anew.items() if not now[name].equal(x)}
+    assert {n for n in learnt if n[:6] in ("actors", "critic")} == {
+        f"actors.{actor}", f"critics.{actor}",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("other", [
+    ["--action-repeat", "4"], ["--floor-brightness", "0.1"], ["--env", "Walker2DBulletEnv-v0"],
+    ["--absorbing", "2"], ["--gamma", "3"], ["--deter", "8"],
+])  # fmt: skip
+def test_a_frozen_model_takes_no_settings_of_other_experience(trained, other, capsys):
+    assert frozen.main([str(trained), *other]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
 
 
 @pytest.mark.parametrize("actor", ["stochastic", "deterministic"])
