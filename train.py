@@ -8,6 +8,7 @@ they call it. No other file reads settings, holds an optimiser or knows a run's 
 
 import atexit
 import contextlib
+import copy
 import csv
 import ctypes
 import dataclasses
@@ -124,6 +125,7 @@ class Settings:
     critic_lr: Amount = 8e-5  # of each critic (Dreamer)
     critic_norm: bool = False  # LayerNorm in critics, whose values else may run away (ours)
     mdn_lr: Amount = 2e-4  # of the mixture density network (§5)
+    play_rate: Share = 1.0  # soft update of the actors that play; 1: those that learn (ours)
     grad_clip: Amount = 100.0  # largest global gradient norm of an optimiser step (Dreamer)
     overshoot: Annotated[int, Interval(ge=0, le=1000)] = 0  # steps ahead that rewards learn (ours)
     free_nats: Amount = 3.0  # KL below this costs nothing; of `kl` only (Dreamer)
@@ -154,7 +156,7 @@ PRESETS = {
         deter=128, stoch=64, hidden=128, units=128, depth=16, batch_size=20, length=25,
         mdn_units=128, prefill=2000, starts=0.5, floor_brightness=0.4, reward_weight=20.0,
         squared_reward=True, action_penalty=0.01, beta_share=True, overshoot=10, critic_lr=5e-4,
-        absorbing=5, critic_norm=True, actor_lr=2e-4, horizon=10,
+        absorbing=5, critic_norm=True, actor_lr=2e-4, horizon=10, play_rate=0.01,
     ),
     "paper": dict(steps=1_000_000, train_every=1000, updates=100),
 }
@@ -243,6 +245,7 @@ def update_actor(
     if name == "stochastic":
         metrics["stochastic_actor/sigma"] = actor.distribution(starts).stddev.mean()
     agent.step(f"{name}_actor", loss, metrics, len(starts))
+    soft_update(agent.players[name], actor, s.play_rate)
     with agent.autocast():
         loss = critic_loss(critic, dream, returns, s.smooth_l1)
     metrics[f"{name}_critic/loss"] = loss
@@ -382,6 +385,8 @@ class Agent(nn.Module):
         self.actors = nn.ModuleDict({"stochastic": actors.StochasticActor(size, actions, s.units)})
         if s.deterministic_actor:
             self.actors["deterministic"] = actors.DeterministicActor(size, actions, s.units)
+        # What acts in the environment: moving averages of the actors (`play_rate`).
+        self.players = copy.deepcopy(self.actors).requires_grad_(False)
         self.critics = nn.ModuleDict()
         learners = {"model": (self.model, s.model_lr)}
         for name, actor in self.actors.items():
@@ -409,12 +414,12 @@ class Agent(nn.Module):
     @property
     def evaluated(self) -> nn.Module:
         """The actor that evaluation plays: the deterministic one if there is one (§4.1)."""
-        return self.actors["deterministic" if self.s.deterministic_actor else "stochastic"]
+        return self.players["deterministic" if self.s.deterministic_actor else "stochastic"]
 
     def collector(self, episode: int) -> nn.Module:
         """The actor that plays an episode of training: the explorer, or both in turn."""
-        turn = episode % len(self.actors) if self.s.collect == "both" else 0
-        return list(self.actors.values())[turn]
+        turn = episode % len(self.players) if self.s.collect == "both" else 0
+        return list(self.players.values())[turn]
 
     @property
     def entropy_scale(self) -> Tensor | float:

@@ -80,7 +80,7 @@ def play_all(agent: Agent, env, name: str, alive: list[float], count: int):
     s, episodes, found = agent.s, [], defaultdict(list)
     for k in range(count):
         alive.clear()
-        episode = play(agent, env, agent.actors[name], 2**31 - 1 - k, s.eval_max_steps)
+        episode = play(agent, env, agent.players[name], 2**31 - 1 - k, s.eval_max_steps)
         episodes.append(episode)
         for key, value in measure(agent, name, episode).items():
             found[key].append(value)
@@ -102,7 +102,7 @@ def measure(agent: Agent, name: str, episode: Episode) -> dict[str, np.ndarray]:
         saturated: (L, A) whether an action is within 0.01 of its bound.
         greedy, sigma: (L, A) the actor's mode in each state, and the explorer's σ.
     """
-    s, model, actor, rewards = agent.s, agent.model, agent.actors[name], episode.rewards
+    s, model, actor, rewards = agent.s, agent.model, agent.players[name], episode.rewards
     images, actions = (
         torch.from_numpy(x).to(agent.device) for x in (episode.images, episode.actions)
     )

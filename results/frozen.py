@@ -65,7 +65,7 @@ def learn(command: argparse.Namespace, settings: list[str]) -> None:
         train.update_actor(agent, name, starts, s.beta_start, s, metrics := {}, updates % 50 == 1)
         promised.append(metrics[f"{name}_actor/return"].item())
         if updates % command.every == 0:
-            policy, seeds = agent.actors[name].mode, range(command.episodes)
+            policy, seeds = agent.players[name].mode, range(command.episodes)
             episodes = [play(agent, env, policy, 2**31 - 1 - k, s.eval_max_steps) for k in seeds]
             earned = " ".join(f"{e.total:.0f} ({e.length})" for e in episodes)
             said = f"promised {np.mean(promised[-50:]):.1f}, discounted; earned {earned}"

@@ -107,9 +107,9 @@ def show(command: argparse.Namespace) -> None:
         raise ValueError(f"--episodes is {command.episodes}: give 1 or more.")
     folder = command.folder
     s, env, agent, name = load(folder, command.checkpoint, command.device, command.precision)
-    if command.actor not in ("evaluated", *agent.actors):
+    if command.actor not in ("evaluated", *agent.players):
         raise ValueError(f"{folder} has no {command.actor} actor: leave out --actor.")
-    actor = agent.evaluated if command.actor == "evaluated" else agent.actors[command.actor]
+    actor = agent.evaluated if command.actor == "evaluated" else agent.players[command.actor]
     seeds = [2**31 - 1 - k for k in range(command.episodes)]  # those of every evaluation
     episodes = [play(agent, env, actor.mode, seed, s.eval_max_steps) for seed in seeds]
     returns, lengths = np.array([(e.total, e.length) for e in episodes]).T

@@ -139,7 +139,7 @@ def test_collection(preset, benchmark, capsys):
     def eighty() -> None:  # six times: an episode has 500
         nonlocal state
         for _ in range(80):
-            last, policy = replay.last, agent.actors["stochastic"]
+            last, policy = replay.last, agent.players["stochastic"]
             action, state = act(agent, policy, last["image"], last["action"], state)
             action = explore(action, s.action_noise, s.random_action, rng)
             image, reward, terminated, _, _ = env.step(action)

@@ -58,6 +58,7 @@ LEARNING = {
     "action_penalty": (0.01, 0.0), "beta_share": (True, False), "starts": (0.5, 1.0),
     "overshoot": (10, 0), "critic_lr": (5e-4, 8e-5), "absorbing": (5, 0),
     "critic_norm": (True, False), "actor_lr": (2e-4, 8e-5), "horizon": (10, 15),
+    "play_rate": (0.01, 1.0),
 }  # fmt: skip
 ACTIONS = 2
 
@@ -90,9 +91,10 @@ def make_batch(s: Settings) -> dict[str, torch.Tensor]:
 
 
 def networks(agent: Agent) -> dict[str, torch.nn.Module]:
-    """Every network by the name of its optimiser, and the target MDN, which has none."""
+    """Every network by the name of its optimiser, and the averaged ones, which have none."""
     named = {"model": agent.model}
     named |= {f"{name}_actor": net for name, net in agent.actors.items()}
+    named |= {f"{name}_player": net for name, net in agent.players.items()}
     named |= {f"{name}_critic": net for name, net in agent.critics.items()}
     if hasattr(agent, "mdn"):
         named |= {"mdn": agent.mdn, "target_mdn": agent.target_mdn}
@@ -177,7 +179,7 @@ def test_arms_hold_the_networks_of_the_table_and_evaluate_the_right_actor(arm):
     with_entropy = arm in ("dreamer-maxent", "maxent")
     actors = ["stochastic", "deterministic"] if with_entropy else ["stochastic"]
     assert list(agent.actors) == list(agent.critics) == actors
-    assert agent.evaluated is agent.actors[actors[-1]]
+    assert agent.evaluated is agent.players[actors[-1]]
     assert hasattr(agent, "mdn") == hasattr(agent, "target_mdn") == with_entropy
     assert (agent.model.termination is not None) == (arm in ("revised", "maxent"))
     critic = agent.critics["stochastic"].net[0].in_features
@@ -187,10 +189,10 @@ def test_arms_hold_the_networks_of_the_table_and_evaluate_the_right_actor(arm):
 @pytest.mark.parametrize("collect, turns", [("explorer", "SSSS"), ("both", "SDSD")])
 def test_the_explorer_collects_alone_or_in_turn_with_the_deterministic_actor(collect, turns):
     agent = make_agent(tiny("maxent", collect=collect))
-    actors = {"S": agent.actors["stochastic"], "D": agent.actors["deterministic"]}
+    actors = {"S": agent.players["stochastic"], "D": agent.players["deterministic"]}
     assert [agent.collector(k) for k in range(4)] == [actors[turn] for turn in turns]
     alone = make_agent(tiny("revised", collect=collect))
-    assert [alone.collector(k) for k in range(2)] == 2 * [alone.actors["stochastic"]]
+    assert [alone.collector(k) for k in range(2)] == 2 * [alone.players["stochastic"]]
 
 
 SWITCHES = [name for name, value in dataclasses.asdict(Settings()).items() if value is True]
@@ -287,6 +289,22 @@ def test_target_mdn_starts_as_the_online_one_and_moves_a_tenth_of_the_way_to_it(
         torch.testing.assert_close(target, 0.9 * old + 0.1 * online)
 
 
+@pytest.mark.parametrize("rate", [0.0, 0.01, 1.0])
+def test_players_start_as_the_actors_and_move_at_their_rate_to_what_was_learnt(rate):
+    """At 1, the default, they are the actors, to the bit."""
+    s = tiny("maxent", play_rate=rate)
+    (agent, _), before = updated(s), snapshot(make_agent(s))
+    after = snapshot(agent)
+    for name in ("stochastic", "deterministic"):
+        of_player = before[f"{name}_player"], after[f"{name}_player"]
+        for old, new, first, now in zip(
+            before[f"{name}_actor"], after[f"{name}_actor"], *of_player, strict=True
+        ):
+            assert torch.equal(old, first) and not torch.equal(old, new)
+            torch.testing.assert_close(now, (1 - rate) * old + rate * new)
+            assert torch.equal(now, new) == (rate == 1) and torch.equal(now, old) == (rate == 0)
+
+
 @pytest.mark.parametrize("arm", NAMES)
 def test_each_step_of_an_update_touches_only_its_own_network(arm):
     """No actor's loss leaves a gradient in model, critic or MDN; no step moves another network."""
@@ -301,7 +319,8 @@ def test_each_step_of_an_update_touches_only_its_own_network(arm):
 
     s = tiny(arm)
     watched_update(s, watch)
-    assert sorted(steps) == sorted(networks(make_agent(s)).keys() - {"target_mdn"})
+    learners = networks(make_agent(s)).keys() - {"target_mdn"}
+    assert sorted(steps) == sorted(name for name in learners if "player" not in name)
 
 
 def test_a_step_is_adams_on_the_clipped_gradient_of_its_own_loss():
@@ -373,7 +392,7 @@ def test_beta_moves_the_stochastic_actor_and_not_the_deterministic_one():
     """Eq. (7): the entropy is the stochastic actor's alone."""
     for arm in ("dreamer-maxent", "maxent"):
         (one, _), (other, _) = (updated(tiny(arm), beta) for beta in (0.0, 0.2))
-        assert changed(snapshot(one), snapshot(other)) == {"stochastic_actor"}
+        assert changed(snapshot(one), snapshot(other)) == {"stochastic_actor", "stochastic_player"}
 
 
 def test_terminal_states_start_no_dream():
