@@ -12,6 +12,7 @@ import copy
 import csv
 import ctypes
 import dataclasses
+import functools
 import io
 import json
 import os
@@ -39,6 +40,7 @@ from annotated_types import Interval
 from pydantic import TypeAdapter, ValidationError
 from scipy import stats
 from torch import Tensor, nn
+from torch.utils import benchmark
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
@@ -791,12 +793,27 @@ def make_agent(s: Settings, env, device: str = "auto", precision: str = "auto") 
         raise ValueError(f"The networks cannot be made: {str(error).splitlines()[0]}") from None
 
 
+@functools.cache
 def has_bfloat16(device: torch.device) -> bool:
-    """Whether bfloat16 matrix products are in the hardware; emulated, they are slow."""
+    """Whether bfloat16 products are in the hardware; emulated, they are slow. On some processors
+    that have them PyTorch convolves without them, so one convolution is timed in both."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     capabilities = torch.cpu.get_capabilities()
-    return any(capabilities.get(name, False) for name in ("avx512_bf16", "amx_bf16", "bf16"))
+    if not any(capabilities.get(name, False) for name in ("avx512_bf16", "amx_bf16", "bf16")):
+        return False
+    slower = convolution_seconds(torch.bfloat16) / convolution_seconds(torch.float32)
+    if slower > 3:  # about 1 where they are used, 6 where not
+        say(f"Convolutions in bfloat16 are {slower:.0f} times slower here: float32 is used.")
+    return slower <= 3
+
+
+def convolution_seconds(dtype: torch.dtype) -> float:
+    """The least that one of the encoder's takes on this CPU."""
+    x, weight = torch.ones(50, 16, 31, 31, dtype=dtype), torch.ones(32, 16, 4, 4, dtype=dtype)
+    given = {"f": nn.functional.conv2d, "x": x, "weight": weight}
+    timer = benchmark.Timer("f(x, weight, stride=2)", globals=given)
+    return min(timer.blocked_autorange(min_run_time=0.1).times)
 
 
 @dataclass(frozen=True)

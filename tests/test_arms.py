@@ -559,7 +559,10 @@ def test_neighbours_take_the_place_of_the_mdn(bfloat16):
     s = tiny("maxent", density="knn")
     assert not {"mdn", "target_mdn"} & networks(make_agent(s)).keys()
     one, other = (updated(s, beta, bfloat16) for beta in (0.1, 0.0))
-    assert changed(snapshot(one[0]), snapshot(other[0])) == {"stochastic_actor", "stochastic_player"}
+    assert changed(snapshot(one[0]), snapshot(other[0])) == {
+        "stochastic_actor",
+        "stochastic_player",
+    }
     assert one[1]["mdn/entropy"] == other[1]["mdn/entropy"] and "mdn/nll" not in one[1]
     asked = []
     with pytest.MonkeyPatch.context() as patch:

@@ -22,7 +22,7 @@ import torch
 from gymnasium.envs.registration import EnvSpec
 
 from env import Replay
-from train import ARMS, Agent, Settings, main, read_checkpoint
+from train import ARMS, Agent, Settings, has_bfloat16, main, read_checkpoint
 
 TRAIN = Path(__file__).parent.parent / "train.py"
 TINY = (
@@ -387,6 +387,19 @@ def test_bad_input_ends_with_one_sentence_and_code_2_and_nothing_written(
 def test_a_device_that_is_not_there_is_refused(capsys):
     assert main(["--device", "cuda"]) == 2
     assert one_sentence(capsys.readouterr().err)
+
+
+@pytest.mark.parametrize("slower", [0.5, 6.0])
+def test_bfloat16_is_used_where_it_is_in_hardware_and_convolutions_use_it(
+    slower, monkeypatch, capsys
+):
+    seconds, cpu = {torch.bfloat16: slower, torch.float32: 1.0}, torch.device("cpu")
+    monkeypatch.setattr("train.convolution_seconds", seconds.get)
+    monkeypatch.setattr("torch.cpu.get_capabilities", lambda: {"avx512_bf16": True})
+    assert has_bfloat16.__wrapped__(cpu) == (slower < 1)
+    assert ("6 times slower here" in capsys.readouterr().err) == (slower > 1)
+    monkeypatch.setattr("torch.cpu.get_capabilities", lambda: {"avx512_bf16": False})
+    assert not has_bfloat16.__wrapped__(cpu)
 
 
 def test_a_folder_that_holds_a_run_is_never_overwritten(uninterrupted):
