@@ -84,7 +84,6 @@ class Settings:
     floor_brightness: Share = 1.0  # factor on a PyBullet floor's texture; 1 is its own (ours)
 
     termination: bool = True  # §4.2: learn when episodes end, and let returns end there
-    absorbing: Annotated[int, Interval(ge=0, le=100)] = 0  # rows that repeat an end, with it (ours)
     observe_first: bool = True  # §4.2: see o_0 before choosing a_0 (Dreamer's code does too)
     fixed_prior: bool = True  # §4.2: KL to N(0, 1) and Jeffreys to the prior, not KL to the prior
     q_critic: bool = True  # §4.2 minor 1: the critic is Q(s, a), not V(s)
@@ -113,7 +112,6 @@ class Settings:
     gamma_q: Share = 0.9  # γ of the discounted state distribution (§5)
     beta_start: Amount = 0.2  # entropy coefficient β at the first environment step (§5)
     beta_end: Amount = 0.0001  # and at the last, linear between (§5)
-    beta_share: bool = False  # β is the norm of ∇Ĥ's part against ∇R's, not a factor on Ĥ (ours)
     density: Literal["mdn", "knn"] = "mdn"  # whose entropy: §4.1's MDN, or of neighbours' distances
     mdn_components: Size = 8  # components of the mixture density network (§5: heads)
     mdn_units: Size = 256  # its hidden units (§5: 256)
@@ -129,7 +127,6 @@ class Settings:
     mdn_lr: Amount = 2e-4  # of the mixture density network (§5)
     play_rate: Share = 1.0  # soft update of the actors that play; 1: those that learn (ours)
     grad_clip: Amount = 100.0  # largest global gradient norm of an optimiser step (Dreamer)
-    overshoot: Annotated[int, Interval(ge=0, le=1000)] = 0  # steps ahead that rewards learn (ours)
     free_nats: Amount = 3.0  # KL below this costs nothing; of `kl` only (Dreamer)
     image_weight: Amount = 1.0  # weight of the image's loss (Dreamer)
     reward_weight: Amount = 1.0  # of the reward's loss (Dreamer)
@@ -157,8 +154,8 @@ PRESETS = {
     "small": dict(  # sizes and cadence for two CPU cores, and what results/trials.md found to help
         deter=128, stoch=64, hidden=128, units=128, depth=16, batch_size=20, length=25,
         mdn_units=128, prefill=2000, starts=0.5, floor_brightness=0.4, reward_weight=20.0,
-        squared_reward=True, action_penalty=0.01, beta_share=True, overshoot=10, critic_lr=5e-4,
-        absorbing=5, critic_norm=True, actor_lr=2e-4, horizon=10, play_rate=0.01,
+        squared_reward=True, termination_weight=1.0, action_penalty=0.01, critic_lr=5e-4,
+        critic_norm=True, actor_lr=2e-4, horizon=10, play_rate=0.01,
     ),
     "paper": dict(steps=1_000_000, train_every=1000, updates=100),
 }
@@ -189,7 +186,7 @@ def update(
     }  # fmt: skip
     with agent.autocast():
         terms, states = agent.model.loss(batch)
-        loss = sum(weights[name.removesuffix("_ahead")] * term for name, term in terms.items())
+        loss = sum(weights[name] * term for name, term in terms.items())
     metrics = {f"model/{name}": term for name, term in terms.items()}
     metrics["reward_r2"] = reward_r2(agent, states, batch)
     agent.step("model", loss, metrics)
@@ -235,12 +232,11 @@ def update_actor(
         terms = {"return": actor_loss(returns, dream.continues, s.first_state_only)}
         if explores:
             metrics["mdn/entropy"] = future_entropy(agent, dream)
-            terms["entropy"] = -metrics["mdn/entropy"]
+            terms["entropy"] = -beta * metrics["mdn/entropy"]
         if look and explores:
-            measure_gradients(agent, actor, terms, beta, metrics, len(starts))
-        loss = terms["return"] + s.action_penalty * actor.raw(starts).square().sum(-1).mean()
-        if explores:
-            loss = loss + beta * agent.entropy_scale * terms["entropy"]
+            measure_gradients(actor, terms, metrics, len(starts))
+        penalty = s.action_penalty * actor.raw(starts).square().sum(-1).mean()
+        loss = sum(terms.values()) + penalty
     metrics[f"{name}_actor/return"] = returns[0].mean()
     metrics[f"{name}_actor/saturated"] = (dream.action.abs() > 0.99).float().mean()
     metrics[f"{name}_actor/deviation"] = actor.mode(starts).detach().std(0).mean()  # over states
@@ -269,20 +265,13 @@ def future_entropy(agent: "Agent", dream) -> Tensor:
 
 
 def measure_gradients(
-    agent: "Agent", actor: nn.Module, terms: dict[str, Tensor], beta: float, metrics: dict,
-    count: int = 1,
-) -> None:  # fmt: skip
-    """The norms of the gradients of both terms of Eq. (7) apart, and their averages: `beta_share`
-    needs them, since the β of §5 is for one size of state and one robot's rewards."""
-    norms = {}
+    actor: nn.Module, terms: dict[str, Tensor], metrics: dict[str, Tensor], count: int
+) -> None:
+    """The norms of the gradients of R_0 and of βĤ, Eq. (7), apart: which of them leads."""
     for name, term in terms.items():
         gradients = torch.autograd.grad(term, list(actor.parameters()), retain_graph=True)
         average_over_processes(gradients, count)
-        norms[name] = nn.utils.get_total_norm(gradients)
-    average, now = agent.gradient_norms, torch.stack([norms["return"], norms["entropy"]])
-    average.lerp_(now, 0.1 if average.any() else 1.0)
-    metrics["stochastic_actor/return_grad_norm"] = norms["return"]
-    metrics["stochastic_actor/entropy_grad_norm"] = beta * agent.entropy_scale * norms["entropy"]
+        metrics[f"stochastic_actor/{name}_grad_norm"] = nn.utils.get_total_norm(gradients)
 
 
 def train(run: "Run", stop: Callable[[], bool]) -> None:
@@ -314,9 +303,6 @@ def train(run: "Run", stop: Callable[[], bool]) -> None:
                 action = explore(action, s.action_noise, s.random_action, run.rng)
             image, reward, terminated, truncated, info = env.step(action)
             replay.add(image, action, reward, terminated)
-            for _ in range(s.absorbing if terminated and s.termination else 0):
-                anything = run.rng.uniform(-1, 1, action.shape)
-                replay.add(image, anything, 0.0, terminated)  # whatever is done there, it is over
             run.note_decision(action, terminated or truncated, info)
         else:
             if rank() == 0:
@@ -381,7 +367,7 @@ class Agent(nn.Module):
             termination=s.termination, fixed_prior=s.fixed_prior,
             smooth_l1=s.smooth_l1 and not s.squared_reward,
             decode_stoch_only=s.decode_stoch_only, observe_first=s.observe_first,
-            free_nats=s.free_nats, overshoot=s.overshoot,
+            free_nats=s.free_nats,
         )  # fmt: skip
         size = self.model.size
         self.actors = nn.ModuleDict({"stochastic": actors.StochasticActor(size, actions, s.units)})
@@ -405,8 +391,6 @@ class Agent(nn.Module):
             self.target_mdn.load_state_dict(self.mdn.state_dict())
             self.target_mdn.requires_grad_(False)
             learners["mdn"] = self.mdn, s.mdn_lr
-        if s.entropy:
-            self.register_buffer("gradient_norms", torch.zeros(2))  # of ∇R and ∇Ĥ, averaged
         self.to(device)
         self.optimisers = {
             name: torch.optim.Adam(network.parameters(), lr, fused=True)
@@ -422,12 +406,6 @@ class Agent(nn.Module):
         """The actor that plays an episode of training: the explorer, or both in turn."""
         turn = episode % len(self.players) if self.s.collect == "both" else 0
         return list(self.players.values())[turn]
-
-    @property
-    def entropy_scale(self) -> Tensor | float:
-        """The factor on Ĥ beside β: 1 (§4.1), or what gives ∇Ĥ the norm of ∇R (`beta_share`)."""
-        of_return, of_entropy = self.gradient_norms
-        return of_return / of_entropy.clamp(min=1e-9) if self.s.beta_share else 1.0
 
     def autocast(self) -> torch.autocast:
         """Matrix products and convolutions in bfloat16. A context holds the weights it has cast,
@@ -514,8 +492,7 @@ def unsaved(s: Settings) -> int:
 def replay_in(folder: Path, s: Settings, actions: int) -> Replay:
     """A process's replay. A checkpoint needs its window of the ring whole until two more are
     written."""
-    reserve = 3 * (unsaved(s) + s.absorbing)
-    return Replay(s.replay_capacity, actions, folder / "replay.bin", reserve)
+    return Replay(s.replay_capacity, actions, folder / "replay.bin", 3 * unsaved(s))
 
 
 class Run:
@@ -863,8 +840,7 @@ def check(text: str, where: str = "") -> Settings:
         raise ValueError(f"{where}{wrong['msg']}.") from None
     n, least = processes(), s.prefill + s.train_every
     rows = s.prefill // s.action_repeat // n
-    ends = s.absorbing + 1 if s.termination else 1  # rows in which nothing is left to do, at most
-    live = s.starts * s.batch_size * (s.length // (ends + 1)) / n  # states to dream from, at least
+    live = s.starts * s.batch_size * (s.length // 2) / n  # states that are no ends, at least
     enough = s.density != "knn" or live >= 4
     for possible, sentence in (
         (s.batch_size % n == 0, f"--batch-size {s.batch_size} is no multiple of {n} processes"),
@@ -872,7 +848,6 @@ def check(text: str, where: str = "") -> Settings:
         (s.length <= s.replay_capacity, f"--replay-capacity is less than --length {s.length}"),
         (s.steps >= least, f"--steps {s.steps} leaves no update after --prefill: give {least}"),
         (s.eval_every >= s.train_every, f"--eval-every is less than --train-every {s.train_every}"),
-        (s.length > ends, f"--length {s.length} may hold nothing but an end: give {ends + 1}"),
         (enough, "--density knn needs four states to dream from: raise --batch-size or --length"),
     ):
         if not possible:

@@ -196,19 +196,17 @@ class WorldModel(nn.Module):
         observe_first: z_0 is inferred from o_0, so a_0 depends on it (§4.2). Without it s_0 is
             zero and o_0 is never seen.
         free_nats: KL below which there is nothing to gain (Dreamer); with `fixed_prior` unused.
-        overshoot: steps without images over which reward and termination are predicted too.
     """
 
     def __init__(
         self, actions: int, *, deter: int, stoch: int, hidden: int, units: int, depth: int,
         termination: bool, fixed_prior: bool, smooth_l1: bool, decode_stoch_only: bool,
-        observe_first: bool, free_nats: float, overshoot: int,
+        observe_first: bool, free_nats: float,
     ):  # fmt: skip
         super().__init__()
         self.deter, self.stoch, self.size = deter, stoch, deter + stoch
         self.fixed_prior, self.smooth_l1, self.free_nats = fixed_prior, smooth_l1, free_nats
         self.decode_stoch_only, self.observe_first = decode_stoch_only, observe_first
-        self.overshoot = overshoot
         self.encoder = Encoder(depth)
         # One dense layer on (z, a), in two parts: the action's needs no recurrence.
         self.dense_stoch = nn.Linear(stoch, hidden, bias=False)
@@ -318,7 +316,6 @@ class WorldModel(nn.Module):
             kl_standard  KL(posterior ‖ N(0, 1)), which gives the prior no gradient (§4.2)
             jeffreys     KL(posterior ‖ prior) + KL(prior ‖ posterior) (§4.2)
             kl           max(KL(posterior ‖ prior), free nats), Dreamer's, in place of the last two
-            reward_ahead, termination_ahead   the same two in dreams, if `overshoot`
 
         Departures from print: the sign before KL in (4); the prior of step t + 1 in (3) lacks the
         action, which h_{t+1} holds.
@@ -335,45 +332,18 @@ class WorldModel(nn.Module):
         image = self.decoder.nll(
             self.decoded(observed.state).flatten(0, 1), batch["image"].flatten(0, 1)
         )
-        terms = {
-            "image": masked_mean(image.view_as(seen), seen),
-            **self.arrivals(observed.state, batch["reward"], batch["terminated"], arrived),
-        }
-        if self.overshoot:
-            terms |= {f"{k}_ahead": v for k, v in self.ahead(observed.state, batch).items()}
-        terms |= self.divergences(observed.posterior, observed.prior, seen)
-        return terms, observed.state
-
-    def arrivals(
-        self, state: Tensor, reward: Tensor, terminated: Tensor, arrived: Tensor
-    ) -> dict[str, Tensor]:
-        """The terms of `loss` for what is received in states (…, D), where one has `arrived`."""
-        error = self.predict_reward(state) - reward
+        error = self.predict_reward(observed.state) - batch["reward"]
         squared = 0.5 * error.square()
         loss = F.smooth_l1_loss(error, 0 * error, reduction="none") if self.smooth_l1 else squared
-        terms = {"reward": masked_mean(loss, arrived)}
+        terms = {
+            "image": masked_mean(image.view_as(seen), seen),
+            "reward": masked_mean(loss, arrived),
+        }
         if self.termination is not None:
-            bce = F.binary_cross_entropy_with_logits(
-                self.termination(state).squeeze(-1), terminated.float(), reduction="none"
-            )
-            terms["termination"] = masked_mean(bce, arrived)
-        return terms
-
-    def ahead(self, state: Tensor, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """The terms of `arrivals` in dreams along the recorded actions, one from a state (B, T, D)
-        of each sequence drawn at random: what actors live on is learnt where they live."""
-        count, length = state.shape[:2]
-        steps = min(self.overshoot, length - 1)
-        begin = torch.randint(length - steps, (count,), device=state.device)
-        rows = begin + torch.arange(1, steps + 1, device=state.device).unsqueeze(1)  # (steps, B)
-        each = torch.arange(count, device=state.device)
-        action, reward, terminated, is_first = (
-            batch[name][each, rows] for name in ("action", "reward", "terminated", "is_first")
-        )
-        taken = iter([*action, action[-1]])  # the last one is chosen, not taken
-        dream = self.imagine(state[each, begin], lambda _: next(taken), steps)
-        within = (~is_first).float().cumprod(0)  # up to the next episode
-        return self.arrivals(dream.state[1:], reward, terminated, within)
+            logit, terminated = self.termination(observed.state).squeeze(-1), batch["terminated"]
+            loss = F.binary_cross_entropy_with_logits(logit, terminated.float(), reduction="none")
+            terms["termination"] = masked_mean(loss, arrived)
+        return terms | self.divergences(observed.posterior, observed.prior, seen), observed.state
 
     def divergences(self, posterior: Normal, prior: Normal, seen: Tensor) -> dict[str, Tensor]:
         """The terms of `loss` that hold the posterior to the prior, in nats, summed over z."""

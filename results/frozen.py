@@ -24,7 +24,7 @@ from env import Replay, make_env
 from results.play import ACTORS, exit_code, take
 
 EXPERIENCE = (  # settings of what was seen, which only the run itself could change
-    "env", "action_repeat", "camera_distance", "floor_brightness", "absorbing", "replay_capacity",
+    "env", "action_repeat", "camera_distance", "floor_brightness", "replay_capacity",
 )  # fmt: skip
 
 

@@ -95,7 +95,7 @@ CASES = (
     | {f"{arm}, half the starts": tiny(arm, starts=0.5, **STILL) for arm in ARMS}
     | {
         "blind": tiny("maxent", observe_first=False, **STILL),
-        "share of gradients": tiny("maxent", beta_share=True, action_penalty=0.01, **STILL),
+        "penalty": tiny("maxent", action_penalty=0.01, **STILL),
     }
 )
 MARGINS = {"below all, above one": 0.5, "above all, below one": 1.5}
@@ -108,7 +108,7 @@ def keep_gradients(rank: int, folder: Path, cases: dict[str, Settings]) -> None:
 
 def keep_weights(rank: int, folder: Path) -> None:
     """Those after fifty updates on different rows, and the random number that comes next."""
-    s = dataclasses.replace(tiny("maxent"), beta_share=True, starts=0.5)
+    s = dataclasses.replace(tiny("maxent"), starts=0.5)
     agent = make_agent(s)
     torch.manual_seed(rank)
     for number in range(50):

@@ -284,7 +284,7 @@ def test_fresh_actors_learn_in_a_model_that_stays_as_it_is(trained, actor, capsy
 
 @pytest.mark.parametrize("other", [
     ["--action-repeat", "4"], ["--floor-brightness", "0.1"], ["--env", "Walker2DBulletEnv-v0"],
-    ["--absorbing", "2"], ["--gamma", "3"], ["--deter", "8"],
+    ["--gamma", "3"], ["--deter", "8"],
 ])  # fmt: skip
 def test_a_frozen_model_takes_no_settings_of_other_experience(trained, other, capsys):
     assert frozen.main([str(trained), *other]) == 2

@@ -21,7 +21,6 @@ import pytest
 import torch
 from gymnasium.envs.registration import EnvSpec
 
-from env import Replay
 from train import ARMS, Agent, Settings, has_bfloat16, main, read_checkpoint
 
 TRAIN = Path(__file__).parent.parent / "train.py"
@@ -86,23 +85,6 @@ def test_other_robots_train(env, tmp_path):
     done = run("--env", env, "--steps", 100, "--run-dir", tmp_path / "run", *small)
     assert done.returncode == 0, done.stderr
     assert len(metrics(tmp_path / "run")) == 1
-
-
-@pytest.mark.parametrize("switch, copies", [(["--absorbing", "3"], 3), (["--no-termination"], 0)])
-def test_the_end_of_an_episode_is_repeated_with_any_action_and_no_reward(switch, copies, tmp_path):
-    """`terminated` alone: nothing follows it. Without a model of ends there is nothing to learn."""
-    folder = tmp_path / "run"
-    assert main(["--steps", "120", "--run-dir", str(folder), *TINY, *switch]) == 0
-    rows = np.fromfile(folder / "replay.bin", Replay(1, 3).dtype)
-    rows = rows[: read_checkpoint(folder)[1]["kept"]["saved_rows"]]
-    ends = [i for i in np.flatnonzero(rows["terminated"]) if not rows["terminated"][i - 1]]
-    assert len(ends) > 2
-    for i in ends[:-1]:  # the last may be the run's
-        same = rows[i : i + copies + 1]
-        assert same["terminated"].all() and not same["is_first"].any()
-        assert rows["is_first"][i + copies + 1] and same["reward"][0]  # the end has its own
-        assert (same["image"] == rows["image"][i]).all() and not same["reward"][1:].any()
-        assert len(np.unique(same["action"], axis=0)) == copies + 1
 
 
 def test_equal_seeds_give_equal_metrics_and_other_seeds_others(tmp_path):
@@ -362,7 +344,6 @@ BAD = {
     "--resume nowhere": "nowhere",
     "--resume nowhere --steps 7": "nowhere",
     "--horizon 1000000": "--horizon",
-    "--absorbing 24": "--length",
     "--density knn --batch-size 1 --length 7": "--batch-size",
     "--density gauss": "knn",
     "--updates 1000000000": "--updates",

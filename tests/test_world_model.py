@@ -21,7 +21,7 @@ def make_model(**changes) -> WorldModel:
     sizes = dict(deter=DETER, stoch=STOCH, hidden=8, units=8, depth=2)
     switches = dict(
         termination=True, fixed_prior=True, smooth_l1=True, decode_stoch_only=True,
-        observe_first=True, free_nats=0.0, overshoot=0,
+        observe_first=True, free_nats=0.0,
     )  # fmt: skip
     return WorldModel(ACTIONS, **(sizes | switches | changes))
 
@@ -484,57 +484,3 @@ def test_rewards_keep_their_digits_in_bfloat16():
     with torch.autocast("cpu", torch.bfloat16):
         reward = model.predict_reward(torch.randn(5, model.size))
     torch.testing.assert_close(reward, torch.full((5,), 150.3))
-
-
-@pytest.mark.parametrize("steps", [2, 5])
-def test_terms_ahead_are_those_of_a_hand_rolled_dream_along_the_recorded_actions(steps):
-    model, batch = make_model(overshoot=steps), make_batch()
-    state = loss(model, batch)[1].detach()
-    torch.manual_seed(3)
-    terms = model.ahead(state, batch)
-    torch.manual_seed(3)
-    begin = torch.randint(6 - steps, (3,)).tolist()
-    assert steps == 5 or len(set(begin)) > 1
-    now = torch.stack([state[b, begin[b]] for b in range(3)])
-    reward, termination, count = 0.0, 0.0, 0
-    for k in range(1, steps + 1):
-        action = torch.stack([batch["action"][b, begin[b] + k] for b in range(3)])
-        deter, stoch = now.split([DETER, STOCH], -1)
-        deter = model.recur(deter, stoch, model.dense_action(action))
-        now = torch.cat([deter, world_model.normal(model.prior_net(deter)).rsample()], -1)
-        for b in range(3):
-            t = begin[b] + k
-            if batch["is_first"][b, begin[b] + 1 : t + 1].any():
-                continue  # there the sequence is in another episode
-            error, d = (
-                model.predict_reward(now[b]) - batch["reward"][b, t],
-                model.termination(now[b]),
-            )
-            reward += F.smooth_l1_loss(error, torch.zeros(()))
-            p = torch.sigmoid(d if batch["terminated"][b, t] else -d)
-            termination, count = termination - p.log().squeeze(), count + 1
-    assert steps == 2 or count < 15
-    torch.testing.assert_close(terms["reward"], reward / count)
-    torch.testing.assert_close(terms["termination"], termination / count)
-
-
-@pytest.mark.parametrize("overshoot", [1, 3, 100])
-def test_a_dream_ahead_begins_anywhere_and_stays_in_its_sequence(overshoot):
-    model, batch = make_model(overshoot=overshoot), make_batch(batch=1, length=5)
-    state, reached = torch.zeros(1, 5, DETER + STOCH), set()
-    for seed in range(50):
-        torch.manual_seed(seed)
-        rewards = batch | {"reward": torch.zeros(1, 5, requires_grad=True)}
-        model.ahead(state, rewards)["reward"].backward()
-        reached |= set(rewards["reward"].grad[0].nonzero().flatten().tolist())
-    assert reached == {1, 2, 3, 4}
-
-
-def test_terms_ahead_are_there_only_if_asked_for_and_move_the_prior():
-    batch = make_batch()
-    assert not any(name.endswith("_ahead") for name in loss(make_model(), batch)[0])
-    model = make_model(overshoot=3)
-    terms, _ = loss(model, batch)
-    for name in ("reward_ahead", "termination_ahead"):
-        assert all(moves(terms[name], model.prior_net.parameters()))
-        assert any(moves(terms[name], model.encoder.parameters()))  # through the first state
