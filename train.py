@@ -763,7 +763,9 @@ def make_agent(s: Settings, env, device: str = "auto", precision: str = "auto") 
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
     device = torch.device(device)
-    bfloat16 = has_bfloat16(device) if precision == "auto" else precision == "bfloat16"
+    bfloat16 = precision == "bfloat16"
+    if precision == "auto":
+        bfloat16 = all(gathered(has_bfloat16(device)))  # processes share their gradients' digits
     try:
         return Agent(s, env.action_space.shape[0], device, bfloat16)
     except RuntimeError as error:  # sizes that no memory holds

@@ -48,7 +48,8 @@ def frozen(folder: Path, like: train.Command, seed: int) -> tuple[gym.Env, train
 
 def learn(command: argparse.Namespace, settings: list[str]) -> None:
     """Trains an actor as that run of train.py would, with the β of its start, and prints a line
-    each `every` updates."""
+    each `every` updates: promised to the actor itself, earned by its average (`play_rate`), of
+    which after k updates (1 − play_rate)^k is still untrained."""
     if min(command.updates, command.every, command.episodes) < 1:
         raise ValueError("--updates, --every and --episodes are 1 at least.")
     like = train.parse(["--resume", str(command.folder), *settings])

@@ -108,7 +108,7 @@ def keep_gradients(rank: int, folder: Path, cases: dict[str, Settings]) -> None:
 
 def keep_weights(rank: int, folder: Path) -> None:
     """Those after fifty updates on different rows, and the random number that comes next."""
-    s = dataclasses.replace(tiny("maxent"), starts=0.5)
+    s = dataclasses.replace(tiny("maxent"), starts=0.5, play_rate=0.1)
     agent = make_agent(s)
     torch.manual_seed(rank)
     for number in range(50):

@@ -282,6 +282,23 @@ def test_fresh_actors_learn_in_a_model_that_stays_as_it_is(trained, actor, capsy
     }  # fmt: skip
 
 
+@pytest.mark.parametrize("looker", [play, diagnose, frozen])
+def test_what_plays_is_the_average_of_an_actor(looker, trained, tmp_path, monkeypatch):
+    """As in evaluations: `play_rate` stands between it and what learns."""
+    folder, plain, players = tmp_path / "run", looker.play, []
+    shutil.copytree(trained, folder)
+
+    def watched(agent, env, policy, *rest):
+        player = getattr(policy, "__self__", policy)
+        players.append(any(player is each for each in agent.players.values()))
+        return plain(agent, env, policy, *rest)
+
+    monkeypatch.setattr(looker, "play", watched)
+    brief = ["--updates", "2", "--every", "1"] if looker is frozen else []
+    assert looker.main([str(folder), "--episodes", "1", *brief]) == 0
+    assert len(players) > 0 and all(players)
+
+
 @pytest.mark.parametrize("other", [
     ["--action-repeat", "4"], ["--floor-brightness", "0.1"], ["--env", "Walker2DBulletEnv-v0"],
     ["--gamma", "3"], ["--deter", "8"],
