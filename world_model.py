@@ -332,9 +332,11 @@ class WorldModel(nn.Module):
         image = self.decoder.nll(
             self.decoded(observed.state).flatten(0, 1), batch["image"].flatten(0, 1)
         )
-        error = self.predict_reward(observed.state) - batch["reward"]
-        squared = 0.5 * error.square()
-        loss = F.smooth_l1_loss(error, 0 * error, reduction="none") if self.smooth_l1 else squared
+        pair = self.predict_reward(observed.state), batch["reward"]
+        if self.smooth_l1:
+            loss = F.smooth_l1_loss(*pair, reduction="none")
+        else:
+            loss = 0.5 * F.mse_loss(*pair, reduction="none")
         terms = {
             "image": masked_mean(image.view_as(seen), seen),
             "reward": masked_mean(loss, arrived),
