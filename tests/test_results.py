@@ -73,6 +73,15 @@ def test_each_prediction_stands_beside_what_happened_at_its_step():
     np.testing.assert_allclose(found["open_image"][1, 3, 1], still, rtol=1e-5)
 
 
+@pytest.mark.parametrize("name", ["stochastic", "deterministic"])
+def test_what_is_measured_is_the_actor_that_played(name):
+    agent = Agent(Settings(**TINY), actions=3, device=torch.device("cpu"), bfloat16=False)
+    for value in agent.players[name].parameters():
+        torch.nn.init.zeros_(value)  # it does nothing; the actor that learns would
+    found = diagnose.measure(agent, name, made_up_episode(30, terminated=True))
+    assert not found["greedy"].any()
+
+
 @pytest.mark.parametrize("length, steps", [(30, 2), (1, 1)])
 def test_dreams_outlive_an_end_by_all_the_decisions_before_it(length, steps):
     """c is ½ everywhere: begun k decisions before the end, one in 2^(k+3) lives 3 longer."""
