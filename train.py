@@ -298,9 +298,11 @@ def train(run: "Run", stop: Callable[[], bool]) -> None:
             if run.step < s.prefill:
                 action = run.rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
             else:
-                last, policy = replay.last, agent.collector(run.episode)
+                last, name = replay.last, agent.collector(run.episode)
+                policy = agent.players[name]
                 action, run.state = act(agent, policy, last["image"], last["action"], run.state)
-                action = explore(action, s.action_noise, s.random_action, run.rng)
+                if name == "stochastic":  # the deterministic actor plays as in evaluation
+                    action = explore(action, s.action_noise, s.random_action, run.rng)
             image, reward, terminated, truncated, info = env.step(action)
             replay.add(image, action, reward, terminated)
             run.note_decision(action, terminated or truncated, info)
@@ -402,10 +404,10 @@ class Agent(nn.Module):
         """The actor that evaluation plays: the deterministic one if there is one (§4.1)."""
         return self.players["deterministic" if self.s.deterministic_actor else "stochastic"]
 
-    def collector(self, episode: int) -> nn.Module:
-        """The actor that plays an episode of training: the explorer, or both in turn."""
+    def collector(self, episode: int) -> str:
+        """Which actor plays an episode of training: the explorer, or both in turn."""
         turn = episode % len(self.players) if self.s.collect == "both" else 0
-        return list(self.players.values())[turn]
+        return list(self.players)[turn]
 
     def autocast(self) -> torch.autocast:
         """Matrix products and convolutions in bfloat16. A context holds the weights it has cast,

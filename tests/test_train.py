@@ -21,6 +21,7 @@ import pytest
 import torch
 from gymnasium.envs.registration import EnvSpec
 
+import actors
 from train import ARMS, Agent, Settings, has_bfloat16, main, read_checkpoint
 
 TRAIN = Path(__file__).parent.parent / "train.py"
@@ -106,6 +107,26 @@ def test_coverage_is_of_the_rows_since_the_last_evaluation(tmp_path, monkeypatch
     assert main([*arguments, *TINY]) == 0
     # episodes of seven steps are four decisions: 70, 105 and 140 steps are 40, 60 and 80
     assert rows == [(40, 1), (20, 1), (20, 1)]
+
+
+def test_only_the_explorers_actions_are_disturbed(tmp_path, monkeypatch):
+    """What the deterministic actor collects is what it would earn, so the model learns of that."""
+    seen = []
+
+    def acting(agent, policy, *rest):
+        seen.append(next(name for name, player in agent.players.items() if player is policy))
+        return actors.act(agent, policy, *rest)
+
+    monkeypatch.setattr("train.act", acting)
+    monkeypatch.setattr("train.explore", lambda *all: seen.append("x") or actors.explore(*all))
+    monkeypatch.setitem(
+        gym.registry, "NumPy-v0", EnvSpec("NumPy-v0", NumPyEnv, max_episode_steps=50)
+    )
+    arguments = ["--env", "NumPy-v0", "--steps", "140", "--run-dir", str(tmp_path / "run")]
+    assert main([*arguments, *TINY]) == 0
+    # an episode is four decisions; half of the deterministic actor's first one is prefill
+    turns = 4 * ["stochastic", "x"] + 4 * ["deterministic"]
+    assert seen[: 2 + 2 * len(turns)] == 2 * ["deterministic"] + 2 * turns
 
 
 # ---- runs that are never lost --------------------------------------------------------------------
