@@ -119,7 +119,8 @@ def test_a_run_is_diagnosed_and_left_as_it_is(tmp_path, capsys):
     before = {path: path.read_bytes() for path in folder.iterdir()}
     capsys.readouterr()
     assert diagnose.main([str(folder), "--episodes", "1"]) == 0
-    page = folder / "diagnosis-120.png"
+    last = plot.read_metrics(folder / "metrics.csv")["env_steps"][-1]  # one more, if L is odd
+    page = folder / f"diagnosis-{last:.0f}.png"
     assert page.stat().st_size > 10_000
     assert {path: path.read_bytes() for path in folder.iterdir() if path != page} == before
     said = capsys.readouterr()
@@ -240,7 +241,7 @@ def test_any_run_can_be_played_and_filmed(trained, which, capsys):
     said = capsys.readouterr().out
     if which == "newest":  # the same seeds as evaluation's
         assert f"return {float(last['eval_return']):.1f} " in said
-    name = "120" if which == "newest" else "best"
+    name = last["env_steps"] if which == "newest" else "best"
     with Image.open(trained / f"episode-{name}.gif") as gif:
         assert gif.size == (3 * 128, 140) and gif.n_frames > 1
         assert gif.info["duration"] >= play.SHORTEST
