@@ -54,6 +54,35 @@ def one_sentence(text: str) -> bool:
     return "Traceback" not in text and len(text.strip().splitlines()) == 1
 
 
+class NumPyEnv(gym.Env):
+    """Its rewards and flags are NumPy's own scalars, as many environments' are."""
+
+    metadata: ClassVar = {"render_modes": ["rgb_array"]}
+    action_space = gym.spaces.Box(-1, 1, (2,))
+    observation_space = gym.spaces.Box(-1, 1, (1,))
+    render_mode = "rgb_array"
+
+    def __init__(self, render_mode=None):
+        self.steps = 0
+
+    def reset(self, seed=None, options=None):
+        self.steps = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        return np.zeros(1, np.float32), np.float64(1), np.bool_(self.steps == 7), np.bool_(0), {}
+
+    def render(self):
+        return np.full((64, 64, 3), 30 * self.steps, np.uint8)
+
+
+@pytest.fixture
+def numpy_env(monkeypatch):
+    spec = EnvSpec("NumPy-v0", NumPyEnv, max_episode_steps=50)
+    monkeypatch.setitem(gym.registry, "NumPy-v0", spec)
+
+
 # ---- training ------------------------------------------------------------------------------------
 
 
@@ -96,12 +125,9 @@ def test_equal_seeds_give_equal_metrics_and_other_seeds_others(tmp_path):
     assert metrics(tmp_path / "a") != metrics(tmp_path / "c")
 
 
-def test_coverage_is_of_the_rows_since_the_last_evaluation(tmp_path, monkeypatch):
+def test_coverage_is_of_the_rows_since_the_last_evaluation(tmp_path, monkeypatch, numpy_env):
     rows = []
     monkeypatch.setattr("train.coverage", lambda states: rows.append(states.shape) or 0.0)
-    monkeypatch.setitem(
-        gym.registry, "NumPy-v0", EnvSpec("NumPy-v0", NumPyEnv, max_episode_steps=50)
-    )
     folder = str(tmp_path / "run")
     arguments = ["--env", "NumPy-v0", "--steps", "140", "--eval-every", "35", "--run-dir", folder]
     assert main([*arguments, *TINY]) == 0
@@ -109,7 +135,7 @@ def test_coverage_is_of_the_rows_since_the_last_evaluation(tmp_path, monkeypatch
     assert rows == [(40, 1), (20, 1), (20, 1)]
 
 
-def test_only_the_explorers_actions_are_disturbed(tmp_path, monkeypatch):
+def test_only_the_explorers_actions_are_disturbed(tmp_path, monkeypatch, numpy_env):
     """What the deterministic actor collects is what it would earn, so the model learns of that."""
     seen = []
 
@@ -119,9 +145,6 @@ def test_only_the_explorers_actions_are_disturbed(tmp_path, monkeypatch):
 
     monkeypatch.setattr("train.act", acting)
     monkeypatch.setattr("train.explore", lambda *all: seen.append("x") or actors.explore(*all))
-    monkeypatch.setitem(
-        gym.registry, "NumPy-v0", EnvSpec("NumPy-v0", NumPyEnv, max_episode_steps=50)
-    )
     arguments = ["--env", "NumPy-v0", "--steps", "140", "--run-dir", str(tmp_path / "run")]
     assert main([*arguments, *TINY]) == 0
     # an episode is four decisions; half of the deterministic actor's first one is prefill
@@ -305,34 +328,8 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_what_was_learnt(tmp_p
     assert (folder / "checkpoint.pt").exists()
 
 
-class NumPyEnv(gym.Env):
-    """Its rewards and flags are NumPy's own scalars, as many environments' are."""
-
-    metadata: ClassVar = {"render_modes": ["rgb_array"]}
-    action_space = gym.spaces.Box(-1, 1, (2,))
-    observation_space = gym.spaces.Box(-1, 1, (1,))
-    render_mode = "rgb_array"
-
-    def __init__(self, render_mode=None):
-        self.steps = 0
-
-    def reset(self, seed=None, options=None):
-        self.steps = 0
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        self.steps += 1
-        return np.zeros(1, np.float32), np.float64(1), np.bool_(self.steps == 7), np.bool_(0), {}
-
-    def render(self):
-        return np.full((64, 64, 3), 30 * self.steps, np.uint8)
-
-
-def test_a_run_of_numpys_own_scalars_can_be_resumed(tmp_path, monkeypatch):
+def test_a_run_of_numpys_own_scalars_can_be_resumed(tmp_path, numpy_env):
     """They would make a checkpoint that loads only by executing what is in it."""
-    monkeypatch.setitem(
-        gym.registry, "NumPy-v0", EnvSpec("NumPy-v0", NumPyEnv, max_episode_steps=50)
-    )
     folder = str(tmp_path / "run")
     assert main(["--env", "NumPy-v0", "--steps", "90", "--run-dir", folder, *TINY]) == 0
     assert main(["--resume", folder]) == 0
