@@ -137,19 +137,21 @@ def test_coverage_is_of_the_rows_since_the_last_evaluation(tmp_path, monkeypatch
 
 def test_only_the_explorers_actions_are_disturbed(tmp_path, monkeypatch, numpy_env):
     """What the deterministic actor collects is what it would earn, so the model learns of that."""
-    seen = []
+    seen = []  # who acts, and whether the action before was a disturbed one
 
-    def acting(agent, policy, *rest):
-        seen.append(next(name for name, player in agent.players.items() if player is policy))
-        return actors.act(agent, policy, *rest)
+    def acting(agent, policy, image, action, state):
+        name = next(name for name, player in agent.players.items() if player is policy)
+        seen.append((name, bool((action == 1).all())))
+        return actors.act(agent, policy, image, action, state)
 
     monkeypatch.setattr("train.act", acting)
-    monkeypatch.setattr("train.explore", lambda *all: seen.append("x") or actors.explore(*all))
+    monkeypatch.setattr("train.explore", lambda action, *rest: np.ones_like(action))
     arguments = ["--env", "NumPy-v0", "--steps", "140", "--run-dir", str(tmp_path / "run")]
     assert main([*arguments, *TINY]) == 0
     # an episode is four decisions; half of the deterministic actor's first one is prefill
-    turns = 4 * ["stochastic", "x"] + 4 * ["deterministic"]
-    assert seen[: 2 + 2 * len(turns)] == 2 * ["deterministic"] + 2 * turns
+    explorer = [("stochastic", k > 0) for k in range(4)]
+    turns = explorer + 4 * [("deterministic", False)]
+    assert seen[: 2 + 2 * len(turns)] == 2 * [("deterministic", False)] + 2 * turns
 
 
 # ---- runs that are never lost --------------------------------------------------------------------
