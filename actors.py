@@ -136,7 +136,7 @@ def nudge(action: Tensor, std: float) -> Tensor:
 def explore(
     action: np.ndarray, noise: float, random_probability: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """The action that collection takes (§4.2, minor modification 4): the given one with Gaussian
+    """The action that the explorer takes (§4.2, minor modification 4): the given one with Gaussian
     noise, clipped to [−1, 1], or with a probability a uniform one."""
     if rng.random() < random_probability:
         return rng.uniform(-1, 1, action.shape).astype(np.float32)

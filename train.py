@@ -94,7 +94,7 @@ class Settings:
     entropy: bool = True  # §4.1: the stochastic actor also maximises β × entropy of future states
     deterministic_actor: bool = True  # §4.1: train a deterministic actor too, and evaluate it
     action_noise: Amount = 0.0  # std of noise on actions the explorer collects (Dreamer: 0.3)
-    random_action: Share = 0.1  # §4.2 minor 4: probability that it acts at random (ours)
+    random_action: Share = 0.1  # §4.2 minor 4: how often the explorer acts at random (value ours)
     collect: Collect = "both"  # who collects: the explorer alone, or both actors in turn (ours)
 
     deter: Size = 200  # size of h (Dreamer: 200)

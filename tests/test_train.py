@@ -135,23 +135,33 @@ def test_coverage_is_of_the_rows_since_the_last_evaluation(tmp_path, monkeypatch
     assert rows == [(40, 1), (20, 1), (20, 1)]
 
 
-def test_only_the_explorers_actions_are_disturbed(tmp_path, monkeypatch, numpy_env):
+@pytest.mark.parametrize("arm, collect, turns, noise", [
+    ("maxent", "both", "DSDSD", 0), ("maxent", "explorer", "SSSSS", 0),
+    ("revised", "both", "SSSSS", 0.3),
+])  # fmt: skip
+def test_only_the_explorers_actions_are_disturbed(
+    arm, collect, turns, noise, tmp_path, monkeypatch, numpy_env
+):
     """What the deterministic actor collects is what it would earn, so the model learns of that."""
     seen = []  # who acts, and whether the action before was a disturbed one
 
     def acting(agent, policy, image, action, state):
         name = next(name for name, player in agent.players.items() if player is policy)
-        seen.append((name, bool((action == 1).all())))
+        seen.append((name[0].upper(), bool((action == 1).all())))
         return actors.act(agent, policy, image, action, state)
 
+    def exploring(action, *how):
+        assert how[:2] == (noise, 0.5)
+        return np.ones_like(action)
+
     monkeypatch.setattr("train.act", acting)
-    monkeypatch.setattr("train.explore", lambda action, *rest: np.ones_like(action))
+    monkeypatch.setattr("train.explore", exploring)
     arguments = ["--env", "NumPy-v0", "--steps", "140", "--run-dir", str(tmp_path / "run")]
-    assert main([*arguments, *TINY]) == 0
-    # an episode is four decisions; half of the deterministic actor's first one is prefill
-    explorer = [("stochastic", k > 0) for k in range(4)]
-    turns = explorer + 4 * [("deterministic", False)]
-    assert seen[: 2 + 2 * len(turns)] == 2 * [("deterministic", False)] + 2 * turns
+    assert main([*arguments, "--arm", arm, "--collect", collect, *TINY]) == 0
+    # an episode is four decisions; half of the first one's are prefill
+    pairs = zip(turns, (2, 4, 4, 4, 4), strict=True)
+    expected = [(who, who == "S" and k > 0) for who, n in pairs for k in range(n)]
+    assert seen[: len(expected)] == expected
 
 
 # ---- runs that are never lost --------------------------------------------------------------------
