@@ -6,7 +6,7 @@ prints pytest-benchmark's table and, above it, the rows of the README's table, o
 seconds of an update (median and least) and of its parts, floating-point operations, the machine's
 own matrix rates in bfloat16 and float32, the fraction of the first that is reached, and the peak
 memory; then decisions and environment steps a second of collection. With `| grep '^|'` the rows
-alone. Not part of the default tests.
+alone. Where a CUDA device is, it is measured too. Not part of the default tests.
 """
 
 import ctypes
@@ -36,6 +36,13 @@ from world_model import TransposedConv2d
 
 keep_freed_memory()
 CPU = torch.device("cpu")
+DEVICES = [
+    "cpu",
+    pytest.param(
+        "cuda",
+        marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device is here"),
+    ),
+]
 PARTS = {
     "model": "world model", "stochastic_actor": "explorer", "stochastic_critic": "explorer",
     "deterministic_actor": "deterministic", "deterministic_critic": "deterministic", "mdn": "MDN",
@@ -58,14 +65,21 @@ class PeakMemory:
         return int(re.search(r"VmHWM:\s+(\d+)", status)[1]) / 2**20
 
 
-def matrix_rate(dtype: torch.dtype) -> float:
+def clock() -> float:
+    """Seconds, once a device has done all that it was given."""
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+    return time.perf_counter()
+
+
+def matrix_rate(dtype: torch.dtype, device: torch.device) -> float:
     """GFLOP/s of a 2048 × 2048 matrix product, the median of ten."""
-    a = torch.randn(2048, 2048, dtype=dtype)
+    a = torch.randn(2048, 2048, dtype=dtype, device=device)
     seconds = []
     for _ in range(12):
-        began = time.perf_counter()
+        began = clock()
         a @ a
-        seconds.append(time.perf_counter() - began)
+        seconds.append(clock() - began)
     return 2 * 2048**3 / np.median(seconds[2:]) / 1e9
 
 
@@ -83,47 +97,46 @@ def random_batch(batch: int, length: int, actions: int) -> dict[str, torch.Tenso
 class TimedAgent(Agent):
     """An agent that keeps the seconds up to the end of each optimiser step, by part."""
 
-    def step(self, name, loss, metrics):
-        super().step(name, loss, metrics)
-        now = time.perf_counter()
+    def step(self, name, loss, metrics, count=1):
+        super().step(name, loss, metrics, count)
+        now = clock()
         self.seconds[PARTS[name]] += now - self.clock
         self.clock = now
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("arm", ARMS)
-def test_update(arm, preset, benchmark, capsys, monkeypatch):
-    s = default_settings(arm, preset)
+@pytest.mark.parametrize("device", DEVICES)
+def test_update(device, arm, preset, benchmark, capsys, monkeypatch):
+    s, where = default_settings(arm, preset), torch.device(device)
     torch.manual_seed(0)
-    agent = TimedAgent(s, 3, CPU, bfloat16=has_bfloat16(CPU))
-    batch = random_batch(s.batch_size, s.length, 3)
-    agent.seconds, agent.clock = defaultdict(float), time.perf_counter()
+    agent = TimedAgent(s, 3, where, bfloat16=has_bfloat16(where))
+    batch = {name: x.to(where) for name, x in random_batch(s.batch_size, s.length, 3).items()}
+    agent.seconds, agent.clock = defaultdict(float), clock()
     update(agent, batch, 0.1, s)
     # Counted in PyTorch's form of the transposed convolutions: ours pads, and would count more.
     with monkeypatch.context() as patch, FlopCounterMode(display=False) as counter:
         patch.setattr(TransposedConv2d, "forward", torch.nn.ConvTranspose2d.forward)
         update(agent, batch, 0.1, s)
     agent.seconds.clear()
-    peak = PeakMemory()
+    peak = PeakMemory() if device == "cpu" else lambda: torch.cuda.max_memory_allocated() / 2**30
 
     def timed() -> None:
-        agent.clock = time.perf_counter()
+        agent.clock = clock()
         update(agent, batch, 0.1, s)
 
     rounds = 20 if preset == "small" else 3
     benchmark.pedantic(timed, rounds=rounds)
     memory = peak()
-    gflop, fast, slow = (
-        counter.get_total_flops() / 1e9,
-        *map(matrix_rate, (torch.bfloat16, torch.float32)),
-    )
+    gflop = counter.get_total_flops() / 1e9
+    fast, slow = (matrix_rate(dtype, where) for dtype in (torch.bfloat16, torch.float32))
     seconds, least = benchmark.stats.stats.median, benchmark.stats.stats.min
     spent = [agent.seconds.get(part, 0) / rounds for part in dict.fromkeys(PARTS.values())]
     parts = " | ".join(f"{part:.3f}" if part else "–" for part in spent)
     with capsys.disabled():
         print(
-            f"\n| {arm} | {preset} | {seconds:.3f} | {least:.3f} | {parts} | {gflop:.0f} "
-            f"| {fast:.0f}, {slow:.0f} | {gflop / seconds / fast:.2f} | {memory:.1f} |"
+            f"\n| {arm}{', CUDA' * (device != 'cpu')} | {preset} | {seconds:.3f} | {least:.3f} "
+            f"| {parts} | {gflop:.0f} | {fast:.0f}, {slow:.0f} | {gflop / seconds / fast:.2f} | {memory:.1f} |"
         )
 
 

@@ -2,10 +2,12 @@
 
 import dataclasses
 import math
+from collections import defaultdict
 
 import numpy as np
 import pytest
 import torch
+from benchmark_update import PARTS, TimedAgent, clock
 from scipy import stats
 
 from env import Replay
@@ -340,6 +342,14 @@ def test_a_step_is_adams_on_the_clipped_gradient_of_its_own_loss():
             for old, p in zip(before[name], parameters, strict=True):
                 rate = torch.full_like(p, rates[name.split("_")[-1]])
                 torch.testing.assert_close(old - p, rate, rtol=0.02, atol=0)
+
+
+def test_the_benchmark_times_each_part_of_an_update():
+    s = tiny("maxent")
+    agent = TimedAgent(s, ACTIONS, torch.device("cpu"), bfloat16=False)
+    agent.seconds, agent.clock = defaultdict(float), clock()
+    update(agent, make_batch(s), 0.1, s)
+    assert agent.seconds.keys() == set(PARTS.values()) and min(agent.seconds.values()) > 0
 
 
 @pytest.mark.parametrize("arm", NAMES)
