@@ -136,7 +136,8 @@ def test_update(device, arm, preset, benchmark, capsys, monkeypatch):
     with capsys.disabled():
         print(
             f"\n| {arm}{', CUDA' * (device != 'cpu')} | {preset} | {seconds:.3f} | {least:.3f} "
-            f"| {parts} | {gflop:.0f} | {fast:.0f}, {slow:.0f} | {gflop / seconds / fast:.2f} | {memory:.1f} |"
+            f"| {parts} | {gflop:.0f} | {fast:.0f}, {slow:.0f} | {gflop / seconds / fast:.2f} "
+            f"| {memory:.1f} |"
         )
 
 
