@@ -35,7 +35,7 @@ def test_a_run_trains_and_goes_on(precision, tmp_path):
 
 def test_a_checkpoint_brings_back_random_numbers_and_optimisers(tmp_path):
     run = new_run(parse(["--run-dir", str(tmp_path / "run"), *TINY]))
-    try:
+    with run.lock:
         for optimiser in run.agent.optimisers.values():
             for parameter in optimiser.param_groups[0]["params"]:
                 parameter.grad = torch.ones_like(parameter)
@@ -48,8 +48,6 @@ def test_a_checkpoint_brings_back_random_numbers_and_optimisers(tmp_path):
             for state in optimiser.state.values():
                 assert {value.device.type for value in state.values()} == {"cuda"}
                 assert state["step"] == 1
-    finally:
-        run.lock.release()
 
 
 @pytest.mark.parametrize("arm", ["dreamer", "maxent"])
