@@ -298,7 +298,7 @@ def train(run: "Run", stop: Callable[[], bool]) -> None:
             if run.step < s.prefill:
                 action = run.rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
             else:
-                last, name = replay.last, agent.collector(run.episode)
+                last, name = replay.last, agent.collector(run.episode, run.length)
                 policy = agent.players[name]
                 action, run.state = act(agent, policy, last["image"], last["action"], run.state)
                 if name == "stochastic":  # the deterministic actor plays as in evaluation
@@ -404,9 +404,10 @@ class Agent(nn.Module):
         """The actor that evaluation plays: the deterministic one if there is one (§4.1)."""
         return self.players["deterministic" if self.s.deterministic_actor else "stochastic"]
 
-    def collector(self, episode: int) -> str:
-        """Which actor plays an episode of training: the explorer, or both in turn."""
-        turn = episode % len(self.players) if self.s.collect == "both" else 0
+    def collector(self, episode: int, length: int) -> str:
+        """Which actor takes the next decision of training, so many environment steps into an
+        episode: the explorer, or both in turn, an episode each, of a longer one 1,000 steps."""
+        turn = (episode + length // 1000) % len(self.players) if self.s.collect == "both" else 0
         return list(self.players)[turn]
 
     def autocast(self) -> torch.autocast:
