@@ -48,7 +48,7 @@ import actors
 from actors import Episode, act, actor_loss, critic_loss, explore, imagined_returns, nudge, play
 from env import EnvironmentFault, Replay, coverage, make_env
 from mdn import MixtureDensityNetwork, entropy, mdn_loss, particle_entropy, soft_update
-from world_model import WorldModel
+from world_model import WorldModel, share_of
 
 Arm = Literal["dreamer", "dreamer-maxent", "revised", "maxent"]
 Preset = Literal["small", "paper"]
@@ -104,6 +104,7 @@ class Settings:
     depth: Size = 32  # channels of the first convolution (Dreamer: 32)
     batch_size: Size = 50  # sequences a batch (Dreamer: 50)
     length: Annotated[Size, Interval(ge=2)] = 50  # rows a sequence (Dreamer: 50)
+    decode_share: Share = 1.0  # of a batch's images, those that are decoded (Dreamer: all)
     horizon: Size = 15  # imagined steps, and n of Eq. (10) (Dreamer)
     starts: Share = 1.0  # of a batch's live states, those that actors dream on from (Dreamer: all)
 
@@ -155,7 +156,7 @@ PRESETS = {
         deter=128, stoch=64, hidden=128, units=128, depth=16, batch_size=20, length=25,
         mdn_units=128, prefill=2000, starts=0.5, floor_brightness=0.4, reward_weight=20.0,
         squared_reward=True, termination_weight=1.0, action_penalty=0.01, critic_lr=5e-4,
-        critic_norm=True, actor_lr=2e-4, horizon=10, play_rate=0.01,
+        critic_norm=True, actor_lr=2e-4, horizon=10, play_rate=0.01, decode_share=0.25,
     ),
     "paper": dict(steps=1_000_000, train_every=1000, updates=100),
 }
@@ -209,9 +210,7 @@ def reward_r2(agent: "Agent", states: Tensor, batch: dict[str, Tensor]) -> Tenso
 def dream_starts(states: Tensor, batch: dict[str, Tensor], share: float) -> Tensor:
     """(N, D): a share of a batch's states (B, T, D), but for ends, where nothing follows."""
     starts = states[~batch["terminated"]].detach()
-    if share == 1:
-        return starts
-    return starts[torch.randperm(len(starts))[: max(1, round(share * len(starts)))]]
+    return starts[share_of(len(starts), share)]
 
 
 def update_actor(
@@ -368,8 +367,8 @@ class Agent(nn.Module):
             actions, deter=s.deter, stoch=s.stoch, hidden=s.hidden, units=s.units, depth=s.depth,
             termination=s.termination, fixed_prior=s.fixed_prior,
             smooth_l1=s.smooth_l1 and not s.squared_reward,
-            decode_stoch_only=s.decode_stoch_only, observe_first=s.observe_first,
-            free_nats=s.free_nats,
+            decode_stoch_only=s.decode_stoch_only, decode_share=s.decode_share,
+            observe_first=s.observe_first, free_nats=s.free_nats,
         )  # fmt: skip
         size = self.model.size
         self.actors = nn.ModuleDict({"stochastic": actors.StochasticActor(size, actions, s.units)})

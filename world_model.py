@@ -193,6 +193,7 @@ class WorldModel(nn.Module):
             the learnt prior.
         smooth_l1: Smooth L1 loss of the reward (§4.2, minor 2), in the place of ½(r − r')².
         decode_stoch_only: the decoder sees z alone (§4.2, minor 3), in the place of (h, z).
+        decode_share: of a batch's images, those that are decoded, drawn at random (ours).
         observe_first: z_0 is inferred from o_0, so a_0 depends on it (§4.2). Without it s_0 is
             zero and o_0 is never seen.
         free_nats: KL below which there is nothing to gain (Dreamer); with `fixed_prior` unused.
@@ -201,12 +202,13 @@ class WorldModel(nn.Module):
     def __init__(
         self, actions: int, *, deter: int, stoch: int, hidden: int, units: int, depth: int,
         termination: bool, fixed_prior: bool, smooth_l1: bool, decode_stoch_only: bool,
-        observe_first: bool, free_nats: float,
+        decode_share: float, observe_first: bool, free_nats: float,
     ):  # fmt: skip
         super().__init__()
         self.deter, self.stoch, self.size = deter, stoch, deter + stoch
         self.fixed_prior, self.smooth_l1, self.free_nats = fixed_prior, smooth_l1, free_nats
         self.decode_stoch_only, self.observe_first = decode_stoch_only, observe_first
+        self.decode_share = decode_share
         self.encoder = Encoder(depth)
         # One dense layer on (z, a), in two parts: the action's needs no recurrence.
         self.dense_stoch = nn.Linear(stoch, hidden, bias=False)
@@ -310,7 +312,7 @@ class WorldModel(nn.Module):
     def loss(self, batch: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
         """The loss as named, unweighted means over batch and time: Eqs. (3), (4) and §4.2.
 
-            image        ½ Σ (o − o')² over pixels
+            image        ½ Σ (o − o')² over pixels; of `decode_share` of the images
             reward       Smooth L1, or ½ (r − r')²; first rows arrive with none
             termination  binary cross-entropy on `terminated`, never on `truncated`; likewise
             kl_standard  KL(posterior ‖ N(0, 1)), which gives the prior no gradient (§4.2)
@@ -329,16 +331,16 @@ class WorldModel(nn.Module):
         observed = self.observe(batch["image"], batch["action"], batch["is_first"])
         arrived = (~batch["is_first"]).float()
         seen = torch.ones_like(arrived) if self.observe_first else arrived
-        image = self.decoder.nll(
-            self.decoded(observed.state).flatten(0, 1), batch["image"].flatten(0, 1)
-        )
+        some = share_of(seen.numel(), self.decode_share)
+        z, pixels = self.decoded(observed.state).flatten(0, 1), batch["image"].flatten(0, 1)
+        image = self.decoder.nll(z[some], pixels[some])
         pair = self.predict_reward(observed.state), batch["reward"]
         if self.smooth_l1:
             loss = F.smooth_l1_loss(*pair, reduction="none")
         else:
             loss = 0.5 * F.mse_loss(*pair, reduction="none")
         terms = {
-            "image": masked_mean(image.view_as(seen), seen),
+            "image": masked_mean(image, seen.flatten()[some]),
             "reward": masked_mean(loss, arrived),
         }
         if self.termination is not None:
@@ -360,6 +362,11 @@ class WorldModel(nn.Module):
             "kl_standard": masked_mean(to_standard, seen),
             "jeffreys": masked_mean(jeffreys, seen),
         }
+
+
+def share_of(count: int, share: float) -> Tensor | slice:
+    """Which of so many to take: a share of them, one at least, drawn at random; or all."""
+    return slice(None) if share == 1 else torch.randperm(count)[: max(1, round(share * count))]
 
 
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:

@@ -59,7 +59,7 @@ LEARNING = {
     "action_penalty": (0.01, 0.0), "starts": (0.5, 1.0),
     "critic_lr": (5e-4, 8e-5),
     "critic_norm": (True, False), "actor_lr": (2e-4, 8e-5), "horizon": (10, 15),
-    "play_rate": (0.01, 1.0), "termination_weight": (1.0, 10.0),
+    "play_rate": (0.01, 1.0), "termination_weight": (1.0, 10.0), "decode_share": (0.25, 1.0),
 }  # fmt: skip
 ACTIONS = 2
 
