@@ -118,7 +118,7 @@ class Settings:
     mdn_units: Size = 256  # its hidden units (§5: 256)
     mdn_min_std: Amount = 0.1  # floor under its σ (ours)
     target_rate: Share = 0.1  # soft update of the target MDN (§5)
-    first_action_noise: Amount = 0.1  # on the deterministic actor's first imagined action (ours)
+    dream_noise: Amount = 0.1  # std of noise on the deterministic actor's imagined actions (ours)
     detach_policy: bool = True  # no gradient through what the policy sees in its dream (Dreamer)
     action_penalty: Amount = 0.0  # on actions squared before their tanh, lest it saturate (ours)
     model_lr: Amount = 6e-4  # Adam's learning rate of the world model (Dreamer)
@@ -157,6 +157,7 @@ PRESETS = {
         mdn_units=128, prefill=2000, starts=0.5, floor_brightness=0.4, reward_weight=20.0,
         squared_reward=True, termination_weight=1.0, action_penalty=0.01, critic_lr=5e-4,
         critic_norm=True, actor_lr=2e-4, horizon=10, play_rate=0.01, decode_share=0.25,
+        dream_noise=0.3,
     ),
     "paper": dict(steps=1_000_000, train_every=1000, updates=100),
 }
@@ -221,12 +222,13 @@ def update_actor(
     MDN: Eq. (7) for the stochastic actor, R_0 alone for the deterministic one."""
     actor, critic = agent.actors[name], agent.critics[name]
     explores = name == "stochastic" and s.entropy
-    policy = (lambda state: actor(state.detach())) if s.detach_policy else actor
+
+    def policy(state: Tensor) -> Tensor:
+        action = actor(state.detach() if s.detach_policy else state)
+        return nudge(action, s.dream_noise) if name == "deterministic" else action
+
     with agent.autocast():
-        first = actor(starts)
-        if name == "deterministic":
-            first = nudge(first, s.first_action_noise)
-        dream = agent.model.imagine(starts, policy, s.horizon, first)
+        dream = agent.model.imagine(starts, policy, s.horizon)
         returns = imagined_returns(dream, critic, s.gamma, s.lam)
         terms = {"return": actor_loss(returns, dream.continues, s.first_state_only)}
         if explores:

@@ -265,23 +265,16 @@ class WorldModel(nn.Module):
         state = torch.cat([deter, torch.stack(stochs, 1)], -1)
         return Observed(state, normal(torch.stack(statistics, 1)), normal(self.prior_net(deter)))
 
-    def imagine(
-        self,
-        start: Tensor,
-        policy: Callable[[Tensor], Tensor],
-        horizon: int,
-        first_action: Tensor | None = None,
-    ) -> Dream:
+    def imagine(self, start: Tensor, policy: Callable[[Tensor], Tensor], horizon: int) -> Dream:
         """H steps from N states through the prior, differentiable in the policy's actions.
 
         Args:
             start: (N, D).
             policy: states (N, D) to actions (N, A).
             horizon: H.
-            first_action: (N, A), in the place of policy(start) if given.
         """
         deter, stoch = start.split([self.deter, self.stoch], -1)
-        states, actions = [start], [policy(start) if first_action is None else first_action]
+        states, actions = [start], [policy(start)]
         for _ in range(horizon):
             deter = self.recur(deter, stoch, self.dense_action(actions[-1]))
             stoch = normal(self.prior_net(deter)).rsample()

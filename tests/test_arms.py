@@ -60,6 +60,7 @@ LEARNING = {
     "critic_lr": (5e-4, 8e-5),
     "critic_norm": (True, False), "actor_lr": (2e-4, 8e-5), "horizon": (10, 15),
     "play_rate": (0.01, 1.0), "termination_weight": (1.0, 10.0), "decode_share": (0.25, 1.0),
+    "dream_noise": (0.3, 0.1),
 }  # fmt: skip
 ACTIONS = 2
 
@@ -423,23 +424,24 @@ def test_terminal_states_start_no_dream():
         assert torch.equal(start, states[~batch["terminated"]])
 
 
-def test_first_action_of_the_deterministic_dream_is_noisy_and_stays_in_range():
+def test_actions_of_the_deterministic_dream_are_noisy_and_stay_in_range():
     """Q is asked at a = A(s) alone: its ∂Q/∂a needs actions beside it (a departure)."""
     for noise, saturates in ((0.1, False), (5.0, True)):
-        s = tiny("maxent", first_action_noise=noise, batch_size=50)
+        s = tiny("maxent", dream_noise=noise, batch_size=50)
         agent, dreams = make_agent(s), []
         with torch.no_grad():  # actions near 0, so that little noise is not clipped
             agent.actors["deterministic"].net[-1].weight.mul_(0.01)
-        imagine = agent.model.imagine
-        agent.model.imagine = lambda start, policy, *rest, imagine=imagine, dreams=dreams: (
-            dreams.append((imagine(start, policy, *rest), policy(start))) or dreams[-1][0]
+        imagine, actor, asked = agent.model.imagine, agent.actors["deterministic"], []
+        agent.model.imagine = lambda *given, imagine=imagine, dreams=dreams: (
+            dreams.append(imagine(*given)) or dreams[-1]
         )
+        actor.register_forward_hook(lambda *given, asked=asked: asked.append(given[-1].detach()))
         update(agent, make_batch(s), 0.1, s)
-        _, (dream, chosen) = dreams
-        added = (dream.action[0] - chosen).detach().flatten().numpy()
-        assert dream.action.abs().max() <= 1
-        assert (dream.action[0].abs() == 1).any() == saturates
-        assert (stats.kstest(added / noise, "norm").pvalue > 0.001) != saturates
+        dream, meant = dreams[1], asked[: s.horizon + 1]
+        for taken, action in zip(dream.action.detach(), meant, strict=True):  # a_0 … a_H
+            assert taken.abs().max() <= 1 and (taken.abs() == 1).any() == saturates
+            added = (taken - action).flatten().numpy() / noise
+            assert (stats.kstest(added, "norm").pvalue > 0.001) != saturates
 
 
 # --- what is not finite ---

@@ -439,7 +439,10 @@ def test_imagine_returns_states_and_actions_one_longer_than_rewards_and_continue
 
 def test_gradient_of_every_later_reward_reaches_the_first_action():
     model, first = make_model(), torch.zeros(5, ACTIONS, requires_grad=True)
-    dream = model.imagine(torch.randn(5, DETER + STOCH), policy, 3, first)
+    given = iter([first])
+    dream = model.imagine(
+        torch.randn(5, DETER + STOCH), lambda state: next(given, policy(state)), 3
+    )
     assert torch.equal(dream.action[0], first)
     assert torch.equal(dream.action[1], policy(dream.state[1]))
     for later in (*dream.reward, *dream.continues, dream.state[1, :, DETER:]):  # through z, too
@@ -464,7 +467,7 @@ def test_imagined_step_is_the_observed_one_with_z_from_the_prior():
     with torch.no_grad():
         observed = observe(model, batch)
         starts = observed.state[:, 0].expand(4000, -1)
-        dream = model.imagine(starts, policy, 1, batch["action"][:, 1].expand(4000, -1))
+        dream = model.imagine(starts, lambda _: batch["action"][:, 1].expand(4000, -1), 1)
     h, z = dream.state[1].split([DETER, STOCH], -1)
     torch.testing.assert_close(h, observed.state[:, 1, :DETER].expand(4000, -1))
     noise = (z - observed.prior.mean[0, 1]) / observed.prior.stddev[0, 1]
