@@ -95,7 +95,7 @@ class Settings:
     deterministic_actor: bool = True  # §4.1: train a deterministic actor too, and evaluate it
     action_noise: Amount = 0.0  # std of noise on actions the explorer collects (Dreamer: 0.3)
     random_action: Share = 0.1  # §4.2 minor 4: how often the explorer acts at random (value ours)
-    collect: Collect = "both"  # who collects: the explorer alone, or both actors in turn (ours)
+    collect: Collect = "both"  # who collects: the explorer, or the evaluated actor too (ours)
 
     deter: Size = 200  # size of h (Dreamer: 200)
     stoch: Size = 128  # size of z (§5: 128; Dreamer: 30)
@@ -299,10 +299,10 @@ def train(run: "Run", stop: Callable[[], bool]) -> None:
             if run.step < s.prefill:
                 action = run.rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
             else:
-                last, name = replay.last, agent.collector(run.episode, run.length)
-                policy = agent.players[name]
+                last, explores = replay.last, agent.explores(run.episode, run.length)
+                policy = agent.players["stochastic"] if explores else agent.evaluated.mode
                 action, run.state = act(agent, policy, last["image"], last["action"], run.state)
-                if name == "stochastic":  # the deterministic actor plays as in evaluation
+                if explores:
                     action = explore(action, s.action_noise, s.random_action, run.rng)
             image, reward, terminated, truncated, info = env.step(action)
             replay.add(image, action, reward, terminated)
@@ -405,11 +405,11 @@ class Agent(nn.Module):
         """The actor that evaluation plays: the deterministic one if there is one (§4.1)."""
         return self.players["deterministic" if self.s.deterministic_actor else "stochastic"]
 
-    def collector(self, episode: int, length: int) -> str:
-        """Which actor takes the next decision of training, so many environment steps into an
-        episode: the explorer, or both in turn, an episode each, of a longer one 1,000 steps."""
-        turn = (episode + length // 1000) % len(self.players) if self.s.collect == "both" else 0
-        return list(self.players)[turn]
+    def explores(self, episode: int, length: int) -> bool:
+        """Whether the explorer takes the next decision of training, so many environment steps into
+        an episode, or the evaluated actor, undisturbed: in turn, an episode each, of a longer one
+        1,000 steps."""
+        return self.s.collect == "explorer" or (episode + length // 1000) % 2 == 0
 
     def autocast(self) -> torch.autocast:
         """Matrix products and convolutions in bfloat16. A context holds the weights it has cast,

@@ -188,18 +188,15 @@ def test_arms_hold_the_networks_of_the_table_and_evaluate_the_right_actor(arm):
     assert critic == 8 + s.stoch + ACTIONS * (arm in ("revised", "maxent"))  # Q(s, a) or V(s)
 
 
-@pytest.mark.parametrize(
-    "collect, turns, within", [("explorer", "SSSS", "SSSS"), ("both", "SDSD", "SDDS")]
-)
-def test_the_explorer_collects_alone_or_in_turn_with_the_deterministic_actor(
-    collect, turns, within
-):
-    agent = make_agent(tiny("maxent", collect=collect))
-    assert "".join(agent.collector(k, 998)[0].upper() for k in range(4)) == turns
+@pytest.mark.parametrize("arm", NAMES)
+@pytest.mark.parametrize("collect, turns, within", [
+    ("explorer", (1, 1, 1, 1), (1, 1, 1, 1)), ("both", (1, 0, 1, 0), (1, 0, 0, 1)),
+])  # fmt: skip
+def test_the_explorer_collects_alone_or_in_turn_with_what_is_evaluated(collect, turns, within, arm):
+    agent = make_agent(tiny(arm, collect=collect))
+    assert tuple(agent.explores(k, 998) for k in range(4)) == turns
     long = 998, 1000, 1998, 2000  # steps into one episode, which may never end
-    assert "".join(agent.collector(0, k)[0].upper() for k in long) == within
-    alone = make_agent(tiny("revised", collect=collect))
-    assert [alone.collector(k, 1000) for k in range(2)] == 2 * ["stochastic"]
+    assert tuple(agent.explores(0, k) for k in long) == within
 
 
 SWITCHES = [name for name, value in dataclasses.asdict(Settings()).items() if value is True]

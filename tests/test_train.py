@@ -136,18 +136,18 @@ def test_coverage_is_of_the_rows_since_the_last_evaluation(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize("arm, collect, turns, noise", [
-    ("maxent", "both", "DSDSD", 0), ("maxent", "explorer", "SSSSS", 0),
-    ("revised", "both", "SSSSS", 0.3),
+    ("maxent", "both", "AEAEA", 0), ("maxent", "explorer", "EEEEE", 0),
+    ("revised", "both", "AEAEA", 0.3), ("revised", "explorer", "EEEEE", 0.3),
 ])  # fmt: skip
 def test_only_the_explorers_actions_are_disturbed(
     arm, collect, turns, noise, tmp_path, monkeypatch, numpy_env
 ):
-    """What the deterministic actor collects is what it would earn, so the model learns of that."""
+    """What the evaluated actor collects is what it would earn, so the model learns of that."""
     seen = []  # who acts, and whether the action before was a disturbed one
 
     def acting(agent, policy, image, action, state):
-        name = next(name for name, player in agent.players.items() if player is policy)
-        seen.append((name[0].upper(), bool((action == 1).all())))
+        who = {agent.players["stochastic"]: "E", agent.evaluated.mode: "A"}[policy]
+        seen.append((who, bool((action == 1).all())))
         return actors.act(agent, policy, image, action, state)
 
     def exploring(action, *how):
@@ -160,7 +160,7 @@ def test_only_the_explorers_actions_are_disturbed(
     assert main([*arguments, "--arm", arm, "--collect", collect, *TINY]) == 0
     # an episode is four decisions; half of the first one's are prefill
     pairs = zip(turns, (2, 4, 4, 4, 4), strict=True)
-    expected = [(who, who == "S" and k > 0) for who, n in pairs for k in range(n)]
+    expected = [(who, who == "E" and k > 0) for who, n in pairs for k in range(n)]
     assert seen[: len(expected)] == expected
 
 
