@@ -128,9 +128,9 @@ def critic_loss(critic: nn.Module, dream, returns: Tensor, smooth_l1: bool) -> T
 
 
 def nudge(action: Tensor, std: float) -> Tensor:
-    """An action with reparametrised noise, clipped to [−1, 1]: each of the deterministic actor's
-    dream. Without it Q would only ever be fitted at a = A(s), its slope ∂Q/∂a there be chance, and
-    the actor would learn to live on edges from which a model's small error is a fall."""
+    """An action with reparametrised noise, clipped to [−1, 1]: what an actor earns in its dream, it
+    then earns in spite of it. It also shows the critic of a deterministic actor actions beside
+    A(s), without which its slope ∂Q/∂a there is chance."""
     return (action + std * torch.randn_like(action)).clamp(-1, 1)
 
 

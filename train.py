@@ -95,7 +95,7 @@ class Settings:
     deterministic_actor: bool = True  # §4.1: train a deterministic actor too, and evaluate it
     action_noise: Amount = 0.0  # std of noise on actions the explorer collects (Dreamer: 0.3)
     random_action: Share = 0.1  # §4.2 minor 4: how often the explorer acts at random (value ours)
-    collect: Collect = "both"  # who collects: the explorer, or the evaluated actor too (ours)
+    collect: Collect = "explorer"  # who collects; both: the evaluated actor too, in turn (ours)
 
     deter: Size = 200  # size of h (Dreamer: 200)
     stoch: Size = 128  # size of z (§5: 128; Dreamer: 30)
@@ -118,7 +118,7 @@ class Settings:
     mdn_units: Size = 256  # its hidden units (§5: 256)
     mdn_min_std: Amount = 0.1  # floor under its σ (ours)
     target_rate: Share = 0.1  # soft update of the target MDN (§5)
-    dream_noise: Amount = 0.1  # std of noise on the deterministic actor's imagined actions (ours)
+    dream_noise: Amount = 0.0  # std of noise on the evaluated actor's imagined actions (ours)
     detach_policy: bool = True  # no gradient through what the policy sees in its dream (Dreamer)
     action_penalty: Amount = 0.0  # on actions squared before their tanh, lest it saturate (ours)
     model_lr: Amount = 6e-4  # Adam's learning rate of the world model (Dreamer)
@@ -157,7 +157,7 @@ PRESETS = {
         mdn_units=128, prefill=2000, starts=0.5, floor_brightness=0.4, reward_weight=20.0,
         squared_reward=True, termination_weight=1.0, action_penalty=0.01, critic_lr=5e-4,
         critic_norm=True, actor_lr=2e-4, horizon=10, play_rate=0.01, decode_share=0.25,
-        dream_noise=0.3,
+        dream_noise=0.3, collect="both",
     ),
     "paper": dict(steps=1_000_000, train_every=1000, updates=100),
 }
@@ -211,7 +211,7 @@ def reward_r2(agent: "Agent", states: Tensor, batch: dict[str, Tensor]) -> Tenso
 def dream_starts(states: Tensor, batch: dict[str, Tensor], share: float) -> Tensor:
     """(N, D): a share of a batch's states (B, T, D), but for ends, where nothing follows."""
     starts = states[~batch["terminated"]].detach()
-    return starts[share_of(len(starts), share)]
+    return starts[share_of(len(starts), share, starts.device)]
 
 
 def update_actor(
@@ -221,20 +221,21 @@ def update_actor(
     """An actor dreams on from starts (N, D), learns from its dream, and so do its critic and the
     MDN: Eq. (7) for the stochastic actor, R_0 alone for the deterministic one."""
     actor, critic = agent.actors[name], agent.critics[name]
-    explores = name == "stochastic" and s.entropy
+    with_entropy = name == "stochastic" and s.entropy
+    noise = s.dream_noise if agent.players[name] is agent.evaluated else 0.0
 
     def policy(state: Tensor) -> Tensor:
         action = actor(state.detach() if s.detach_policy else state)
-        return nudge(action, s.dream_noise) if name == "deterministic" else action
+        return nudge(action, noise) if noise else action
 
     with agent.autocast():
         dream = agent.model.imagine(starts, policy, s.horizon)
         returns = imagined_returns(dream, critic, s.gamma, s.lam)
         terms = {"return": actor_loss(returns, dream.continues, s.first_state_only)}
-        if explores:
+        if with_entropy:
             metrics["mdn/entropy"] = future_entropy(agent, dream)
             terms["entropy"] = -beta * metrics["mdn/entropy"]
-        if look and explores:
+        if look and with_entropy:
             measure_gradients(actor, terms, metrics, len(starts))
         penalty = s.action_penalty * actor.raw(starts).square().sum(-1).mean()
         loss = sum(terms.values()) + penalty
@@ -249,7 +250,7 @@ def update_actor(
         loss = critic_loss(critic, dream, returns, s.smooth_l1)
     metrics[f"{name}_critic/loss"] = loss
     agent.step(f"{name}_critic", loss, metrics, len(starts))
-    if explores and s.density == "mdn":
+    if with_entropy and s.density == "mdn":
         with agent.autocast():
             loss = mdn_loss(agent.mdn, dream.state, dream.continues, s.gamma_q).mean()
         metrics["mdn/nll"] = loss
@@ -359,6 +360,9 @@ def interval95(returns: np.ndarray) -> float:
     return float(stats.t.ppf(0.975, len(returns) - 1) * stats.sem(returns))
 
 
+TURN = 1000  # environment steps, the length of a robot's whole episode
+
+
 class Agent(nn.Module):
     """All networks of a run with A actions, and one Adam for each that learns."""
 
@@ -408,8 +412,8 @@ class Agent(nn.Module):
     def explores(self, episode: int, length: int) -> bool:
         """Whether the explorer takes the next decision of training, so many environment steps into
         an episode, or the evaluated actor, undisturbed: in turn, an episode each, of a longer one
-        1,000 steps."""
-        return self.s.collect == "explorer" or (episode + length // 1000) % 2 == 0
+        TURN steps."""
+        return self.s.collect == "explorer" or (episode + length // TURN) % 2 == 0
 
     def autocast(self) -> torch.autocast:
         """Matrix products and convolutions in bfloat16. A context holds the weights it has cast,

@@ -324,7 +324,7 @@ class WorldModel(nn.Module):
         observed = self.observe(batch["image"], batch["action"], batch["is_first"])
         arrived = (~batch["is_first"]).float()
         seen = torch.ones_like(arrived) if self.observe_first else arrived
-        some = share_of(seen.numel(), self.decode_share)
+        some = share_of(seen.numel(), self.decode_share, seen.device)
         z, pixels = self.decoded(observed.state).flatten(0, 1), batch["image"].flatten(0, 1)
         image = self.decoder.nll(z[some], pixels[some])
         pair = self.predict_reward(observed.state), batch["reward"]
@@ -357,9 +357,11 @@ class WorldModel(nn.Module):
         }
 
 
-def share_of(count: int, share: float) -> Tensor | slice:
+def share_of(count: int, share: float, device: torch.device) -> Tensor | slice:
     """Which of so many to take: a share of them, one at least, drawn at random; or all."""
-    return slice(None) if share == 1 else torch.randperm(count)[: max(1, round(share * count))]
+    if share == 1:
+        return slice(None)
+    return torch.randperm(count, device=device)[: max(1, round(share * count))]
 
 
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:

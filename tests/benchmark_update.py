@@ -50,15 +50,20 @@ PARTS = {
 
 
 class PeakMemory:
-    """GiB that the process held at most since it was made (Linux; elsewhere not a number)."""
+    """GiB that the device, or on a CPU the process, held at most since it was made (Linux;
+    elsewhere not a number)."""
 
-    def __init__(self):
-        self.known = Path("/proc/self/clear_refs").exists()
-        if self.known:
+    def __init__(self, device: torch.device):
+        self.cuda, self.known = device.type == "cuda", Path("/proc/self/clear_refs").exists()
+        if self.cuda:
+            torch.cuda.reset_peak_memory_stats()
+        elif self.known:
             ctypes.CDLL(None).malloc_trim(0)
             Path("/proc/self/clear_refs").write_text("5")  # its high-water mark: back to now
 
     def __call__(self) -> float:
+        if self.cuda:
+            return torch.cuda.max_memory_allocated() / 2**30
         if not self.known:
             return float("nan")
         status = Path("/proc/self/status").read_text()
@@ -119,7 +124,7 @@ def test_update(device, arm, preset, benchmark, capsys, monkeypatch):
         patch.setattr(TransposedConv2d, "forward", torch.nn.ConvTranspose2d.forward)
         update(agent, batch, 0.1, s)
     agent.seconds.clear()
-    peak = PeakMemory() if device == "cpu" else lambda: torch.cuda.max_memory_allocated() / 2**30
+    peak = PeakMemory(where)
 
     def timed() -> None:
         agent.clock = clock()

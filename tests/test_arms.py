@@ -60,7 +60,7 @@ LEARNING = {
     "critic_lr": (5e-4, 8e-5),
     "critic_norm": (True, False), "actor_lr": (2e-4, 8e-5), "horizon": (10, 15),
     "play_rate": (0.01, 1.0), "termination_weight": (1.0, 10.0), "decode_share": (0.25, 1.0),
-    "dream_noise": (0.3, 0.1),
+    "dream_noise": (0.3, 0.0), "collect": ("both", "explorer"),
 }  # fmt: skip
 ACTIONS = 2
 
@@ -421,24 +421,41 @@ def test_terminal_states_start_no_dream():
         assert torch.equal(start, states[~batch["terminated"]])
 
 
-def test_actions_of_the_deterministic_dream_are_noisy_and_stay_in_range():
-    """Q is asked at a = A(s) alone: its ∂Q/∂a needs actions beside it (a departure)."""
+@pytest.mark.parametrize("arm, noisy", [("maxent", "deterministic"), ("revised", "stochastic")])
+def test_actions_that_the_evaluated_actor_dreams_are_noisy_and_stay_in_range(arm, noisy):
+    """Each of a_0 … a_H, and nothing of the explorer's."""
     for noise, saturates in ((0.1, False), (5.0, True)):
-        s = tiny("maxent", dream_noise=noise, batch_size=50)
-        agent, dreams = make_agent(s), []
-        with torch.no_grad():  # actions near 0, so that little noise is not clipped
-            agent.actors["deterministic"].net[-1].weight.mul_(0.01)
-        imagine, actor, asked = agent.model.imagine, agent.actors["deterministic"], []
+        s = tiny(arm, dream_noise=noise, batch_size=50)
+        agent, dreams, asked = make_agent(s), [], {}
+        for name, actor in agent.actors.items():
+            with torch.no_grad():  # actions near 0, so that little noise is not clipped
+                actor.net[-1].weight.mul_(0.01)
+                actor.net[-1].bias[ACTIONS:] = -10  # of a σ
+            asked[name] = []
+            actor.register_forward_hook(
+                lambda *given, to=asked[name]: to.append(given[-1].detach())
+            )
+        imagine = agent.model.imagine
         agent.model.imagine = lambda *given, imagine=imagine, dreams=dreams: (
             dreams.append(imagine(*given)) or dreams[-1]
         )
-        actor.register_forward_hook(lambda *given, asked=asked: asked.append(given[-1].detach()))
         update(agent, make_batch(s), 0.1, s)
-        dream, meant = dreams[1], asked[: s.horizon + 1]
-        for taken, action in zip(dream.action.detach(), meant, strict=True):  # a_0 … a_H
-            assert taken.abs().max() <= 1 and (taken.abs() == 1).any() == saturates
-            added = (taken - action).flatten().numpy() / noise
-            assert (stats.kstest(added, "norm").pvalue > 0.001) != saturates
+        for (name, meant), dream in zip(asked.items(), dreams, strict=True):
+            for taken, action in zip(dream.action.detach(), meant[: s.horizon + 1], strict=True):
+                added = (taken - action).flatten().numpy()
+                assert (added == 0).all() == (name != noisy)
+                if name == noisy:
+                    assert taken.abs().max() <= 1 and (taken.abs() == 1).any() == saturates
+                    assert (stats.kstest(added / noise, "norm").pvalue > 0.001) != saturates
+
+
+def test_a_share_of_the_images_is_decoded_as_the_settings_say():
+    s = tiny("maxent", decode_share=0.5)
+    agent, decoded = make_agent(s), []
+    nll = agent.model.decoder.nll
+    agent.model.decoder.nll = lambda z, image: decoded.append(len(z)) or nll(z, image)
+    update(agent, make_batch(s), 0.1, s)
+    assert decoded == [s.batch_size * s.length // 2]
 
 
 # --- what is not finite ---

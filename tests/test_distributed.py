@@ -51,11 +51,13 @@ def whole() -> dict[str, torch.Tensor]:
 LIVE = [int((~shard(rank)["terminated"]).sum()) for rank in range(2)]
 
 
-def chosen(n: int) -> torch.Tensor:
-    """In the place of a random order: half of each process's live states, its first ones."""
-    if n != sum(LIVE):
-        return torch.arange(n)
-    return torch.cat([torch.arange(LIVE[0] // 2), LIVE[0] + torch.arange(LIVE[1] // 2)])
+def chosen(n: int, device: torch.device) -> torch.Tensor:
+    """In the place of a random order: half of each process's live states, or of its rows, its first
+    ones."""
+    for one, other in (LIVE, [ROWS * LENGTH] * 2):
+        if n == one + other:
+            return torch.cat([torch.arange(one // 2), one + torch.arange(other // 2)])
+    return torch.arange(n)
 
 
 def gradients(batch: dict[str, torch.Tensor], s: Settings) -> dict[str, object]:
@@ -95,6 +97,7 @@ CASES = (
     | {f"{arm}, half the starts": tiny(arm, starts=0.5, **STILL) for arm in ARMS}
     | {
         "blind": tiny("maxent", observe_first=False, **STILL),
+        "half the images": tiny("maxent", decode_share=0.5, **STILL),
         "penalty": tiny("maxent", action_penalty=0.01, **STILL),
     }
 )

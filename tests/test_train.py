@@ -135,12 +135,15 @@ def test_coverage_is_of_the_rows_since_the_last_evaluation(tmp_path, monkeypatch
     assert rows == [(40, 1), (20, 1), (20, 1)]
 
 
-@pytest.mark.parametrize("arm, collect, turns, noise", [
-    ("maxent", "both", "AEAEA", 0), ("maxent", "explorer", "EEEEE", 0),
-    ("revised", "both", "AEAEA", 0.3), ("revised", "explorer", "EEEEE", 0.3),
+@pytest.mark.parametrize("arm, collect, turn, turns, noise", [
+    ("maxent", "both", 1000, "AA EEEE AAAA EEEE", 0),
+    ("maxent", "explorer", 1000, "EE EEEE EEEE EEEE", 0),
+    ("revised", "both", 1000, "AA EEEE AAAA EEEE", 0.3),
+    ("revised", "explorer", 1000, "EE EEEE EEEE EEEE", 0.3),
+    ("maxent", "both", 4, "EE EEAA AAEE EEAA", 0),  # as in episodes longer than a turn
 ])  # fmt: skip
 def test_only_the_explorers_actions_are_disturbed(
-    arm, collect, turns, noise, tmp_path, monkeypatch, numpy_env
+    arm, collect, turn, turns, noise, tmp_path, monkeypatch, numpy_env
 ):
     """What the evaluated actor collects is what it would earn, so the model learns of that."""
     seen = []  # who acts, and whether the action before was a disturbed one
@@ -154,13 +157,16 @@ def test_only_the_explorers_actions_are_disturbed(
         assert how[:2] == (noise, 0.5)
         return np.ones_like(action)
 
+    monkeypatch.setattr("train.TURN", turn)
     monkeypatch.setattr("train.act", acting)
     monkeypatch.setattr("train.explore", exploring)
     arguments = ["--env", "NumPy-v0", "--steps", "140", "--run-dir", str(tmp_path / "run")]
     assert main([*arguments, "--arm", arm, "--collect", collect, *TINY]) == 0
-    # an episode is four decisions; half of the first one's are prefill
-    pairs = zip(turns, (2, 4, 4, 4, 4), strict=True)
-    expected = [(who, who == "E" and k > 0) for who, n in pairs for k in range(n)]
+    # an episode is four decisions of two steps; half of the first one's are prefill
+    expected = []
+    for episode in turns.split():
+        disturbed = [False, *(who == "E" for who in episode[:-1])]
+        expected += zip(episode, disturbed, strict=True)
     assert seen[: len(expected)] == expected
 
 

@@ -164,9 +164,12 @@ def test_image_loss_is_minus_the_log_density_of_a_unit_normal_but_for_a_constant
     assert terms["image"].item() + log_density.item() == pytest.approx(constant, abs=0.01)
 
 
-def test_image_loss_of_a_share_of_the_images_is_that_of_all_on_average():
+@pytest.mark.parametrize("observe_first", [True, False])
+def test_image_loss_of_a_share_of_the_images_is_that_of_all_on_average(observe_first):
     """Six of 18 images a draw; the states of both models are the same, seed by seed."""
-    whole, part, batch, drawn = make_model(), make_model(decode_share=1 / 3), make_batch(), []
+    whole = make_model(observe_first=observe_first)
+    part = make_model(observe_first=observe_first, decode_share=1 / 3)
+    batch, drawn = make_batch(), []
     nll = part.decoder.nll
     part.decoder.nll = lambda z, image: drawn.append(nll(z, image)) or drawn[-1]
     with torch.no_grad():
