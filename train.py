@@ -222,8 +222,14 @@ def update_actor(
     MDN: Eq. (7) for the stochastic actor, R_0 alone for the deterministic one."""
     actor, critic = agent.actors[name], agent.critics[name]
     with_entropy = name == "stochastic" and s.entropy
+    noise = s.dream_noise if agent.players[name] is agent.evaluated else 0.0
+
+    def policy(state: Tensor) -> Tensor:
+        action = actor(state.detach() if s.detach_policy else state)
+        return nudge(action, noise) if noise else action
+
     with agent.autocast():
-        dream = agent.model.imagine(starts, dreaming(agent, name, s), s.horizon)
+        dream = agent.model.imagine(starts, policy, s.horizon)
         returns = imagined_returns(dream, critic, s.gamma, s.lam)
         terms = {"return": actor_loss(returns, dream.continues, s.first_state_only)}
         if with_entropy:
@@ -250,19 +256,6 @@ def update_actor(
         metrics["mdn/nll"] = loss
         agent.step("mdn", loss, metrics, len(starts))
         soft_update(agent.target_mdn, agent.mdn, s.target_rate)
-
-
-def dreaming(agent: "Agent", name: str, s: Settings) -> Callable[[Tensor], Tensor]:
-    """What an actor does in its dreams, states (N, D) to actions (N, A): with `detach_policy` no
-    gradient leaves through what it sees; if it is the evaluated one it acts with `dream_noise`."""
-    actor = agent.actors[name]
-    noise = s.dream_noise if agent.players[name] is agent.evaluated else 0.0
-
-    def policy(state: Tensor) -> Tensor:
-        action = actor(state.detach() if s.detach_policy else state)
-        return nudge(action, noise) if noise else action
-
-    return policy
 
 
 def future_entropy(agent: "Agent", dream) -> Tensor:
