@@ -187,7 +187,10 @@ def particle_entropy(states: Tensor, continues: Tensor, gamma: float, k: int = 3
     weights = torch.cat([weights[:-1], weights[-1:] + tail])
     starts, size = following.shape[1:]
     with torch.no_grad():
-        drawn = torch.multinomial(weights.T, 1).squeeze(1)  # (N,) which of each start's futures
+        # (N,) which of each start's futures, by the inverse of its w's cumulative sum, which ends
+        # at one but for rounding
+        drawn = (weights.cumsum(0) < torch.rand(starts, device=weights.device)).sum(0)
+        drawn = drawn.clamp(max=len(weights) - 1)
         others = following[drawn, torch.arange(starts, device=drawn.device)]  # (N, d)
         distance = torch.cdist(following.flatten(0, 1), others).unflatten(0, (-1, starts))
         distance.diagonal(dim1=1, dim2=2).fill_(math.inf)  # (n, N, N): its own is no neighbour

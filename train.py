@@ -15,6 +15,7 @@ import dataclasses
 import functools
 import io
 import json
+import math
 import os
 import re
 import shlex
@@ -180,8 +181,10 @@ def update(
         look: also `measure_gradients`, which takes two backward passes more.
 
     Returns:
-        named metrics; the world model's are the unweighted terms of its loss.
+        named metrics; the world model's are the unweighted terms of its loss. A FloatingPointError
+        names those that are not finite; from the first of them on, nothing was changed.
     """
+    live = live_rows(batch)  # asked for first: a GPU has nothing under way that this waits for
     weights = {
         "image": s.image_weight, "reward": s.reward_weight, "termination": s.termination_weight,
         "kl": s.kl_weight, "kl_standard": s.kl_standard_weight, "jeffreys": s.jeffreys_weight,
@@ -192,25 +195,45 @@ def update(
     metrics = {f"model/{name}": term for name, term in terms.items()}
     metrics["reward_r2"] = reward_r2(agent, states, batch)
     agent.step("model", loss, metrics)
-    starts = dream_starts(states, batch, s.starts)
+    starts = dream_starts(states, live, s.starts)
     for name in agent.actors:
         update_actor(agent, name, starts, beta, s, metrics, look)
-    values = torch.stack([value.detach().float() for value in metrics.values()])
-    return dict(zip(metrics, values.tolist(), strict=True))  # one wait for all
+    numbers = as_numbers(metrics)
+    agent.follow()
+    return numbers
+
+
+def as_numbers(metrics: dict[str, Tensor]) -> dict[str, float]:
+    """Metrics as numbers, by one wait for the device. A FloatingPointError if one is not finite."""
+    numbers = dict(zip(metrics, stacked(metrics).tolist(), strict=True))
+    if wrong := [name for name, number in numbers.items() if not math.isfinite(number)]:
+        raise FloatingPointError(f"Not finite: {', '.join(wrong)}.")
+    return numbers
+
+
+def stacked(metrics: dict[str, Tensor]) -> Tensor:
+    """(M,) metrics, where they were computed."""
+    return torch.stack([value.detach().float() for value in metrics.values()])
 
 
 @torch.no_grad()
 def reward_r2(agent: "Agent", states: Tensor, batch: dict[str, Tensor]) -> Tensor:
     """The share of the variance of a batch's rewards that its states (B, T, D) predict."""
-    arrived = ~batch["is_first"]
-    reward = batch["reward"][arrived]
-    error = agent.model.predict_reward(states[arrived]) - reward
-    return 1 - error.square().mean() / reward.var(correction=0).clamp(min=1e-6)
+    arrived, reward = (~batch["is_first"]).float(), batch["reward"]
+    weight = arrived / arrived.sum().clamp(min=1)
+    error = (weight * (agent.model.predict_reward(states) - reward).square()).sum()
+    variance = (weight * (reward - (weight * reward).sum()).square()).sum()
+    return 1 - error / variance.clamp(min=1e-6)
 
 
-def dream_starts(states: Tensor, batch: dict[str, Tensor], share: float) -> Tensor:
-    """(N, D): a share of a batch's states (B, T, D), but for ends, where nothing follows."""
-    starts = states[~batch["terminated"]].detach()
+def live_rows(batch: dict[str, Tensor]) -> Tensor:
+    """Which of a batch's B · T rows are no ends, where nothing follows."""
+    return (~batch["terminated"]).flatten().nonzero().squeeze(1)
+
+
+def dream_starts(states: Tensor, live: Tensor, share: float) -> Tensor:
+    """(N, D): a share of the live ones of a batch's states (B, T, D)."""
+    starts = states.flatten(0, 1)[live].detach()
     return starts[share_of(len(starts), share, starts.device)]
 
 
@@ -222,14 +245,8 @@ def update_actor(
     MDN: Eq. (7) for the stochastic actor, R_0 alone for the deterministic one."""
     actor, critic = agent.actors[name], agent.critics[name]
     with_entropy = name == "stochastic" and s.entropy
-    noise = s.dream_noise if agent.players[name] is agent.evaluated else 0.0
-
-    def policy(state: Tensor) -> Tensor:
-        action = actor(state.detach() if s.detach_policy else state)
-        return nudge(action, noise) if noise else action
-
     with agent.autocast():
-        dream = agent.model.imagine(starts, policy, s.horizon)
+        dream = agent.model.imagine(starts, dreaming(agent, name, s), s.horizon)
         returns = imagined_returns(dream, critic, s.gamma, s.lam)
         terms = {"return": actor_loss(returns, dream.continues, s.first_state_only)}
         if with_entropy:
@@ -241,11 +258,10 @@ def update_actor(
         loss = sum(terms.values()) + penalty
     metrics[f"{name}_actor/return"] = returns[0].mean()
     metrics[f"{name}_actor/saturated"] = (dream.action.abs() > 0.99).float().mean()
-    metrics[f"{name}_actor/deviation"] = actor.mode(starts).detach().std(0).mean()  # over states
+    metrics[f"{name}_actor/deviation"] = actor.mode(starts).detach().std(0, correction=0).mean()
     if name == "stochastic":
         metrics["stochastic_actor/sigma"] = actor.distribution(starts).stddev.mean()
     agent.step(f"{name}_actor", loss, metrics, len(starts))
-    soft_update(agent.players[name], actor, s.play_rate)
     with agent.autocast():
         loss = critic_loss(critic, dream, returns, s.smooth_l1)
     metrics[f"{name}_critic/loss"] = loss
@@ -255,7 +271,19 @@ def update_actor(
             loss = mdn_loss(agent.mdn, dream.state, dream.continues, s.gamma_q).mean()
         metrics["mdn/nll"] = loss
         agent.step("mdn", loss, metrics, len(starts))
-        soft_update(agent.target_mdn, agent.mdn, s.target_rate)
+
+
+def dreaming(agent: "Agent", name: str, s: Settings) -> Callable[[Tensor], Tensor]:
+    """What an actor does in its dreams, states (N, D) to actions (N, A): with `detach_policy` no
+    gradient leaves through what it sees; if it is the evaluated one it acts with `dream_noise`."""
+    actor = agent.actors[name]
+    noise = s.dream_noise if agent.players[name] is agent.evaluated else 0.0
+
+    def policy(state: Tensor) -> Tensor:
+        action = actor(state.detach() if s.detach_policy else state)
+        return nudge(action, noise) if noise else action
+
+    return policy
 
 
 def future_entropy(agent: "Agent", dream) -> Tensor:
@@ -422,7 +450,8 @@ class Agent(nn.Module):
 
     def step(self, name: str, loss: Tensor, metrics: dict[str, Tensor], count: int = 1) -> None:
         """One step of the named optimiser on `loss`, a mean of so many; the gradient's norm goes
-        into `metrics`. A FloatingPointError names which is not finite; nothing is changed then."""
+        into `metrics`: not finite if it or the loss is not, in any process. Where a metric is not
+        finite, nothing is changed."""
         optimiser = self.optimisers[name]
         parameters = optimiser.param_groups[0]["params"]
         optimiser.zero_grad()
@@ -430,12 +459,17 @@ class Agent(nn.Module):
         loss = loss.detach().clone()  # not finite in one process, it is so in all
         average_over_processes([loss, *(p.grad for p in parameters)], count)
         norm = nn.utils.clip_grad_norm_(parameters, self.s.grad_clip)
-        metrics[f"{name}/grad_norm"] = norm
-        if not torch.isfinite(norm + loss):
-            named = metrics | {f"{name}/loss": loss}
-            wrong = [key for key, value in named.items() if not torch.isfinite(value)]
-            raise FloatingPointError(f"Not finite: {', '.join(wrong)}.")
+        metrics[f"{name}/grad_norm"] = norm + 0 * loss
+        # Where it is 1 a fused optimiser does nothing; to ask here would wait for the device.
+        optimiser.found_inf = (~stacked(metrics).isfinite().all()).float()
         optimiser.step()
+
+    def follow(self) -> None:
+        """Move the averages that follow what learns: the players, and the target MDN (§4.1)."""
+        for name, player in self.players.items():
+            soft_update(player, self.actors[name], self.s.play_rate)
+        if self.s.entropy and self.s.density == "mdn":
+            soft_update(self.target_mdn, self.mdn, self.s.target_rate)
 
 
 def join_processes() -> None:

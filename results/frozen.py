@@ -62,9 +62,10 @@ def learn(command: argparse.Namespace, settings: list[str]) -> None:
         batch = train.to_tensors(replay.sample(s.batch_size, s.length, rng), agent.device)
         with torch.no_grad(), agent.autocast():
             seen = agent.model.observe(batch["image"], batch["action"], batch["is_first"])
-        starts = train.dream_starts(seen.state, batch, s.starts)
+        starts = train.dream_starts(seen.state, train.live_rows(batch), s.starts)
         train.update_actor(agent, name, starts, s.beta_start, s, metrics := {}, updates % 50 == 1)
-        promised.append(metrics[f"{name}_actor/return"].item())
+        promised.append(train.as_numbers(metrics)[f"{name}_actor/return"])
+        agent.follow()
         if updates % command.every == 0:
             policy, seeds = agent.players[name].mode, range(command.episodes)
             episodes = [play(agent, env, policy, 2**31 - 1 - k, s.eval_max_steps) for k in seeds]

@@ -17,6 +17,7 @@ from train import (
     Agent,
     Settings,
     act,
+    as_numbers,
     beta_at,
     default_settings,
     interval95,
@@ -473,7 +474,7 @@ def all_state(agent: Agent):
 
 
 @pytest.mark.parametrize("name", make_agent(tiny("maxent")).optimisers)
-def test_a_loss_or_gradient_that_is_not_finite_is_refused_by_name_and_changes_nothing(name):
+def test_a_loss_or_gradient_that_is_not_finite_changes_nothing_and_is_refused_by_name(name):
     agent, _ = updated(tiny("maxent"))
     before = all_state(agent)
     parameters = list(networks(agent)[name].parameters())
@@ -481,8 +482,9 @@ def test_a_loss_or_gradient_that_is_not_finite_is_refused_by_name_and_changes_no
     no_number = total * math.nan
     steep = (total - total.detach()).abs().sqrt()  # 0, of slope ∞ · 0
     for loss in (no_number, steep):
+        agent.step(name, loss, metrics := {})
         with pytest.raises(FloatingPointError, match=f"Not finite: .*{name}"):
-            agent.step(name, loss, {})
+            as_numbers(metrics)
     after = all_state(agent)
     assert len(before) == len(after) > 4 * len(parameters)
     assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
@@ -499,13 +501,25 @@ def test_an_infinite_loss_of_finite_gradient_is_refused():
 
 
 def test_a_reward_that_is_not_a_number_stops_the_update_before_anything_moves():
-    s = tiny("maxent")
-    agent, batch = make_agent(s), make_batch(s)
+    s = tiny("maxent", play_rate=0.5)
+    (agent, _), batch = updated(s), make_batch(s)
     batch["reward"][:] = math.nan
     before = all_state(agent)
     with pytest.raises(FloatingPointError, match="Not finite: model/reward"):
         update(agent, batch, 0.1, s)
     assert all(torch.equal(a, b) for a, b in zip(before, all_state(agent), strict=True))
+
+
+@pytest.mark.parametrize("density", ["mdn", "knn"])
+def test_a_model_that_knows_no_numbers_any_more_stops_the_update_and_nothing_moves(density):
+    s = tiny("maxent", density=density, play_rate=0.5)
+    (agent, _), batch = updated(s), make_batch(s)
+    agent.model.gru.weight_hh.data.fill_(math.nan)
+    before = all_state(agent)
+    with pytest.raises(FloatingPointError, match="Not finite: model/image, .*model/grad_norm"):
+        update(agent, batch, 0.1, s)
+    pairs = zip(before, all_state(agent), strict=True)
+    assert all(torch.equal(a, b) or a.isnan().all() for a, b in pairs)
 
 
 # --- what learning was found to need ---
@@ -613,7 +627,7 @@ def test_reward_r2_is_one_of_exact_predictions_and_leaves_first_rows_out():
     agent, batch = make_agent(s), make_batch(s)
     batch["reward"][batch["is_first"]] = 1e6
     states = torch.randn(*batch["reward"].shape, agent.model.size)
-    agent.model.predict_reward = lambda states: batch["reward"][~batch["is_first"]]
+    agent.model.predict_reward = lambda states: batch["reward"].where(~batch["is_first"], 0)
     assert reward_r2(agent, states, batch).item() == 1
     mean = batch["reward"][~batch["is_first"]].mean()
     agent.model.predict_reward = lambda states: mean

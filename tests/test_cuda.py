@@ -1,12 +1,13 @@
 """What only a CUDA device can show: `pytest -m cuda` where there is one."""
 
 import csv
+import warnings
 
 import pytest
 import torch
 from test_arms import make_batch, tiny
 
-from train import Agent, main, new_run, parse
+from train import Agent, main, new_run, parse, update
 
 CUDA = torch.device("cuda")
 TINY = (
@@ -48,6 +49,21 @@ def test_a_checkpoint_brings_back_random_numbers_and_optimisers(tmp_path):
             for state in optimiser.state.values():
                 assert {value.device.type for value in state.values()} == {"cuda"}
                 assert state["step"] == 1
+
+
+@pytest.mark.parametrize("density", ["mdn", "knn"])
+def test_an_update_waits_for_the_device_at_its_start_and_at_its_end_alone(density):
+    s = tiny("maxent", density=density, starts=0.5)
+    agent = Agent(s, 2, CUDA, bfloat16=True)
+    batch = {name: value.to(CUDA) for name, value in make_batch(s).items()}
+    update(agent, batch, 0.1, s)
+    torch.cuda.set_sync_debug_mode("warn")
+    try:
+        with warnings.catch_warnings(record=True, action="always") as waits:
+            update(agent, batch, 0.1, s)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert len(waits) == 2, [str(each.message) for each in waits]
 
 
 @pytest.mark.parametrize("arm", ["dreamer", "maxent"])
