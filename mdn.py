@@ -13,6 +13,7 @@ q / P taken to be one.
 """
 
 import math
+from itertools import accumulate
 from typing import NamedTuple
 
 import torch
@@ -97,7 +98,9 @@ def discounted_weights(continues: Tensor, gamma: float) -> tuple[Tensor, Tensor]
     Returns:
         w of shape (n, N) and w_b of shape (N,).
     """
-    mass = torch.cat([torch.ones_like(continues[:1]), (gamma * continues).cumprod(0)])
+    # Step by step: the gradient of `cumprod` would wait for a GPU to see whether there are zeros.
+    one = torch.ones_like(continues[0])
+    mass = torch.stack([*accumulate(gamma * continues, torch.mul, initial=one)])
     return mass[:-1] - mass[1:], mass[-1]
 
 

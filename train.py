@@ -450,8 +450,8 @@ class Agent(nn.Module):
 
     def step(self, name: str, loss: Tensor, metrics: dict[str, Tensor], count: int = 1) -> None:
         """One step of the named optimiser on `loss`, a mean of so many; the gradient's norm goes
-        into `metrics`: not finite if it or the loss is not, in any process. Where a metric is not
-        finite, nothing is changed."""
+        into `metrics`: not finite if it or the loss is not, in any process. Where one is not, of
+        this step or before it, nothing is changed."""
         optimiser = self.optimisers[name]
         parameters = optimiser.param_groups[0]["params"]
         optimiser.zero_grad()
@@ -461,7 +461,8 @@ class Agent(nn.Module):
         norm = nn.utils.clip_grad_norm_(parameters, self.s.grad_clip)
         metrics[f"{name}/grad_norm"] = norm + 0 * loss
         # Where it is 1 a fused optimiser does nothing; to ask here would wait for the device.
-        optimiser.found_inf = (~stacked(metrics).isfinite().all()).float()
+        norms = {key: value for key, value in metrics.items() if key.endswith("grad_norm")}
+        optimiser.found_inf = (~stacked(norms).isfinite().all()).float()
         optimiser.step()
 
     def follow(self) -> None:

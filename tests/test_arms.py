@@ -481,7 +481,7 @@ def test_a_loss_or_gradient_that_is_not_finite_changes_nothing_and_is_refused_by
     total = sum(p.sum() for p in parameters)
     no_number = total * math.nan
     steep = (total - total.detach()).abs().sqrt()  # 0, of slope ∞ · 0
-    for loss in (no_number, steep):
+    for loss in (no_number, steep, total + math.inf):
         agent.step(name, loss, metrics := {})
         with pytest.raises(FloatingPointError, match=f"Not finite: .*{name}"):
             as_numbers(metrics)

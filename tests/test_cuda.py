@@ -53,17 +53,19 @@ def test_a_checkpoint_brings_back_random_numbers_and_optimisers(tmp_path):
 
 @pytest.mark.parametrize("density", ["mdn", "knn"])
 def test_an_update_waits_for_the_device_at_its_start_and_at_its_end_alone(density):
-    s = tiny("maxent", density=density, starts=0.5)
+    switches = dict(starts=0.5, decode_share=0.5, dream_noise=0.3, critic_norm=True)
+    s = tiny("maxent", density=density, **switches)
     agent = Agent(s, 2, CUDA, bfloat16=True)
     batch = {name: value.to(CUDA) for name, value in make_batch(s).items()}
     update(agent, batch, 0.1, s)
-    torch.cuda.set_sync_debug_mode("warn")
-    try:
-        with warnings.catch_warnings(record=True, action="always") as waits:
-            update(agent, batch, 0.1, s)
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-    assert len(waits) == 2, [str(each.message) for each in waits]
+    with warnings.catch_warnings(record=True, action="always") as warned:
+        torch.cuda.set_sync_debug_mode("warn")
+        try:
+            update(agent, batch, 0.1, s, look=True)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+    said = [str(each.message) for each in warned]
+    assert len([text for text in said if "synchronizing" in text]) == 2, said
 
 
 @pytest.mark.parametrize("arm", ["dreamer", "maxent"])

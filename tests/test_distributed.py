@@ -2,6 +2,7 @@
 after a death, and nobody waits for the dead. Two processes on the CPU, by gloo."""
 
 import dataclasses
+import math
 import os
 import signal
 import subprocess
@@ -121,6 +122,20 @@ def keep_weights(rank: int, folder: Path) -> None:
     torch.save((agent.state_dict(), torch.rand(1)), folder / f"weights.{rank}")
 
 
+def meet_infinity(rank: int, folder: Path) -> None:
+    """One process's reward is infinite, where Smooth L1 is too and its gradient is 1: what each
+    then says, and whether its model is as it was."""
+    s = tiny("maxent")
+    agent, batch = make_agent(s), shard(rank)
+    before = [p.clone() for p in agent.model.parameters()]
+    batch["reward"][0, LENGTH // 2] = math.inf if rank == 0 else 0.0
+    batch["is_first"][0, LENGTH // 2] = False
+    with pytest.raises(FloatingPointError) as stopped:
+        update(agent, batch, 0.1, s)
+    same = all(torch.equal(a, b) for a, b in zip(before, agent.model.parameters(), strict=True))
+    torch.save((str(stopped.value), same), folder / f"infinity.{rank}")
+
+
 def outlive(rank: int, folder: Path) -> None:
     """The second process dies; the seconds until the first one knows."""
     s = tiny("maxent")
@@ -141,6 +156,7 @@ def work(rank: int, folder: Path, cases: dict[str, Settings]) -> None:
     dist.init_process_group("gloo", f"file://{folder}/meeting", rank=rank, world_size=2)
     keep_gradients(rank, folder, cases)
     keep_weights(rank, folder)
+    meet_infinity(rank, folder)
     outlive(rank, folder)
     dist.destroy_process_group()
 
@@ -188,6 +204,11 @@ def test_parameters_stay_equal_over_fifty_updates(apart):
     assert all(torch.equal(first[name], second[name]) for name in first)
     assert not any(torch.equal(first[name], before[name]) for name in first)
     assert mine != other  # of random numbers
+
+
+def test_an_infinite_loss_in_one_process_stops_both_and_changes_neither(apart):
+    for said, same in (torch.load(apart / f"infinity.{rank}") for rank in range(2)):
+        assert said.startswith("Not finite: ") and "model/grad_norm" in said and same
 
 
 @pytest.mark.parametrize("arm", ARMS)
