@@ -516,7 +516,7 @@ def test_a_model_that_knows_no_numbers_any_more_stops_the_update_and_nothing_mov
     (agent, _), batch = updated(s), make_batch(s)
     agent.model.gru.weight_hh.data.fill_(math.nan)
     before = all_state(agent)
-    with pytest.raises(FloatingPointError, match="Not finite: model/image, .*model/grad_norm"):
+    with pytest.raises(FloatingPointError, match=r"Not finite: model/image, .*model/grad_norm"):
         update(agent, batch, 0.1, s)
     pairs = zip(before, all_state(agent), strict=True)
     assert all(torch.equal(a, b) or a.isnan().all() for a, b in pairs)
