@@ -182,7 +182,7 @@ def update(
 
     Returns:
         named metrics; the world model's are the unweighted terms of its loss. A FloatingPointError
-        names those that are not finite; from the first of them on, nothing was changed.
+        names those that are not finite; from the first such gradient on, nothing was changed.
     """
     live = live_rows(batch)  # asked for first: a GPU has nothing under way that this waits for
     weights = {
