@@ -10,6 +10,7 @@ import torch
 from benchmark_update import PARTS, TimedAgent, clock
 from scipy import stats
 
+from actors import critic_loss
 from env import Replay
 from train import (
     ARMS,
@@ -55,6 +56,7 @@ PAPER = dict(
 SIZES = {"deter", "stoch", "hidden", "units", "depth", "batch_size", "length", "mdn_units"}
 CADENCE = {"steps", "prefill", "train_every", "updates", "eval_every"}
 # What the small preset changes so that the agent learns in an hour, and the paper's literal value.
+# It squares the critics' errors in all arms, too, where `smooth_l1` is of the table above.
 LEARNING = {
     "floor_brightness": (0.4, 1.0), "reward_weight": (20.0, 1.0), "squared_reward": (True, False),
     "action_penalty": (0.01, 0.0), "starts": (0.5, 1.0),
@@ -68,7 +70,8 @@ ACTIONS = 2
 
 def tiny(arm: str, **changes) -> Settings:
     """The paper's literal settings, in tiny networks."""
-    small = {name: literal for name, (_, literal) in LEARNING.items()} | dict(
+    paper = default_settings(arm, "paper")
+    small = {name: getattr(paper, name) for name in (*LEARNING, "smooth_l1")} | dict(
         deter=8, stoch=4, hidden=8, units=8, depth=2, batch_size=3, length=6, horizon=3, mdn_units=8
     )
     return dataclasses.replace(default_settings(arm), **(small | changes))
@@ -165,9 +168,10 @@ def test_paper_preset_holds_the_papers_numbers(arm):
 def test_presets_change_sizes_cadence_and_what_learning_was_found_to_need(arm):
     small, paper = (dataclasses.asdict(default_settings(arm, name)) for name in PRESETS)
     differing = {name for name in small if small[name] != paper[name]}
-    assert differing and differing <= SIZES | CADENCE | LEARNING.keys() | {"preset"}
+    assert differing and differing <= SIZES | CADENCE | LEARNING.keys() | {"preset", "smooth_l1"}
     assert all(small[name] <= paper[name] for name in differing & SIZES)
     assert {name: (small[name], paper[name]) for name in LEARNING} == LEARNING
+    assert not small["smooth_l1"]
 
 
 def test_maxent_is_the_default():
@@ -205,8 +209,9 @@ SWITCHES = [name for name, value in dataclasses.asdict(Settings()).items() if va
 
 @pytest.mark.parametrize("name", SWITCHES)
 def test_each_modification_can_be_taken_away_alone_and_still_trains(name):
-    s = parse([f"--no-{name.replace('_', '-')}"]).settings
-    assert s == dataclasses.replace(default_settings(), **{name: False})
+    s = parse(["--preset", "paper", f"--no-{name.replace('_', '-')}"]).settings
+    paper = default_settings("maxent", "paper")
+    assert s == dataclasses.replace(paper, **{name: False}) != paper
     _, metrics = updated(tiny("maxent", **{name: False}))
     assert all(math.isfinite(value) for value in metrics.values())
     assert metrics != updated(tiny("maxent"))[1]
@@ -606,6 +611,15 @@ def test_rewards_are_squared_where_asked_and_the_critic_keeps_smooth_l1():
         updated(tiny("maxent", squared_reward=on))[1]["model/reward"] for on in (False, True)
     )
     assert plain != squared
+
+
+@pytest.mark.parametrize("on", [True, False])
+def test_smooth_l1_is_of_the_rewards_and_of_both_critics(on):
+    s, asked = tiny("maxent", smooth_l1=on), []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("train.critic_loss", lambda *a: asked.append(a[-1]) or critic_loss(*a))
+        updated(s)
+    assert asked == [on, on] and make_agent(s).model.smooth_l1 == on
 
 
 def test_both_gradients_of_the_objective_are_measured_when_asked():

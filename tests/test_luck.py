@@ -358,6 +358,7 @@ def signals():
     """Leaves to the other tests the handlers that they had."""
     numbers = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
     before = [signal.getsignal(number) for number in numbers]
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup ignores it; a run leaves it so
     yield
     for number, handler in zip(numbers, before, strict=True):
         signal.signal(number, handler)
