@@ -89,7 +89,7 @@ class Settings:
     fixed_prior: bool = True  # §4.2: KL to N(0, 1) and Jeffreys to the prior, not KL to the prior
     q_critic: bool = True  # §4.2 minor 1: the critic is Q(s, a), not V(s)
     smooth_l1: bool = True  # §4.2 minor 2: Smooth L1 for reward and critic, not squared error
-    squared_reward: bool = False  # ½(r − r')² for rewards, whatever smooth_l1 says: a mean (ours)
+    squared_reward: bool = False  # ½(r − r')² for rewards even with smooth_l1: a mean (ours)
     decode_stoch_only: bool = True  # §4.2 minor 3: the decoder sees z, not (h, z)
     first_state_only: bool = True  # §4.2: actors maximise the first imagined state's return alone
     entropy: bool = True  # §4.1: the stochastic actor also maximises β × entropy of future states
