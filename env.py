@@ -11,6 +11,7 @@ import difflib
 import importlib
 import numbers
 import os
+import tempfile
 import traceback
 import warnings
 import zlib
@@ -277,20 +278,16 @@ def coverage(states: np.ndarray, k: int = 3) -> float:
 
 
 class Replay:
-    """A ring of rows of experience, sampled as windows of consecutive rows: records in one array.
-    With a file, the array is that file, mapped: its memory is the page cache's.
+    """A ring of rows of experience in a file, sampled as windows of consecutive rows: records in
+    one array. The file is written to, and mapped to be read: its memory is the page cache's.
 
     Args:
         capacity: newest rows that are sampled; older ones are overwritten.
         actions: A.
-        path: the file; without one the rows are in memory alone.
-        reserve: rows beyond capacity that the ring holds: so many can be added before the newest
-            `capacity` of now are touched, and `restore` can go back to them.
+        path: the file; without one, a temporary one.
     """
 
-    GROWTH = 64  # rows by which the file grows
-
-    def __init__(self, capacity: int, actions: int, path: Path | None = None, reserve: int = 0):
+    def __init__(self, capacity: int, actions: int, path: Path | None = None):
         self.dtype = np.dtype([
             ("image", np.uint8, (IMAGE_SIZE, IMAGE_SIZE, 3)),
             ("action", np.float32, (actions,)),
@@ -298,68 +295,53 @@ class Replay:
             ("terminated", np.bool_),
             ("is_first", np.bool_),
         ], align=True)  # fmt: skip
-        self.capacity, self.ring, self.path = capacity, capacity + reserve, path
-        self.rows = np.zeros(0 if path else self.ring, self.dtype)
+        # The next checkpoint is due `unsaved` rows after the last; `restore` can go back two.
+        self.capacity, self.unsaved = capacity, min(500, capacity)
+        self.ring = capacity + 3 * self.unsaved
         self.checksums = np.zeros(self.ring, np.uint32)  # CRC-32 of each row
         self.added = 0  # rows ever added; row i lies at i % ring
         if path:
             path.touch()
+        self.file = open(path, "r+b", buffering=0) if path else tempfile.TemporaryFile(buffering=0)
 
     def __len__(self) -> int:
         return min(self.added, self.capacity)
 
-    def grow(self) -> None:
-        """Make the file longer, with real zeros: a full disk says so here, as an OSError; written
-        to through the map, it would kill the process."""
-        with open(self.path, "ab") as file:
-            more = min(self.GROWTH, self.ring - len(self.rows))
-            file.truncate(self.rows.nbytes)
-            file.write(bytes(more * self.dtype.itemsize))
-        self.map_file()
-
-    def map_file(self) -> None:
-        """Take the file's whole rows for the array."""
-        whole = self.path.stat().st_size // self.dtype.itemsize
-        self.file = np.memmap(self.path, self.dtype, "r+", shape=whole)
-        self.rows = np.asarray(self.file)
-
     def add(self, image, action=0.0, reward=0.0, terminated=False, is_first=False) -> None:
         """Append one row, of a reset without action and reward. An OSError if the disk is full."""
-        at = self.added % self.ring
-        if at == len(self.rows):
-            self.grow()
-        row = self.rows[at]
+        row, at = np.zeros((), self.dtype), self.added % self.ring
         row["image"], row["action"], row["reward"] = image, action, reward
         row["terminated"], row["is_first"] = terminated, is_first
+        self.file.seek(at * row.nbytes)
+        if self.file.write(row.tobytes()) < row.nbytes:
+            raise OSError(f"{self.file.name}: no space is left for a row")
         self.checksums[at] = zlib.crc32(row.tobytes())
         self.added += 1
+
+    def read(self, number: int) -> bytes:
+        """A row, by its number among all ever added; less of it if the file ends before."""
+        self.file.seek(number % self.ring * self.dtype.itemsize)
+        return self.file.read(self.dtype.itemsize)
 
     @property
     def last(self) -> np.void:
         """The newest row."""
-        return self.rows[(self.added - 1) % self.ring]
+        return np.frombuffer(self.read(self.added - 1), self.dtype)[0]
 
     def flush(self) -> np.ndarray:
         """Bring the file onto the disk: the checksums of the rows that can be sampled."""
-        if self.added:
-            self.file.flush()
+        os.fsync(self.file.fileno())
         return self.checksums[np.arange(self.added - len(self), self.added) % self.ring]
 
     def restore(self, added: int, checksums: np.ndarray) -> None:
         """Go back to when `added` rows had been added and `flush` returned these checksums. A
         ValueError, in one sentence, if the file does not hold those rows."""
         self.added = added
-        if added == 0:
-            return
-        wanted = np.arange(added - len(self), added) % self.ring
-        if self.path.stat().st_size:
-            self.map_file()
-        if wanted.max() >= len(self.rows) or any(
-            zlib.crc32(self.rows[at].tobytes()) != known
-            for at, known in zip(wanted, checksums, strict=True)
-        ):
-            raise ValueError(f"{self.path} does not hold its checkpoint's rows: start a new run.")
-        self.checksums[wanted] = checksums
+        for number, known in zip(range(added - len(self), added), checksums, strict=True):
+            if zlib.crc32(self.read(number)) != known:
+                where = f"{self.file.name} does not hold its checkpoint's rows"
+                raise ValueError(f"{where}: start a new run.")
+            self.checksums[number % self.ring] = known
 
     def sample(self, batch: int, length: int, rng: np.random.Generator) -> np.ndarray:
         """`batch` windows of `length` consecutive rows, each equally likely, as records (B, T).
@@ -368,4 +350,5 @@ class Replay:
         if len(self) < length:
             raise ValueError(f"The replay holds {len(self)} rows, fewer than a window of {length}.")
         first = self.added - len(self) + rng.integers(len(self) - length + 1, size=batch)
-        return self.rows[(first[:, None] + np.arange(length)) % self.ring]
+        rows = np.memmap(self.file, self.dtype, "r", shape=min(self.added, self.ring))
+        return np.asarray(rows)[(first[:, None] + np.arange(length)) % self.ring]

@@ -184,7 +184,8 @@ def update(
         named metrics; the world model's are the unweighted terms of its loss. A FloatingPointError
         names those that are not finite; from the first such gradient on, nothing was changed.
     """
-    live = live_rows(batch)  # asked for first: a GPU has nothing under way that this waits for
+    # Rows that are no ends. Asked for first: a GPU has nothing under way that this waits for.
+    live = (~batch["terminated"]).flatten().nonzero().squeeze(1)
     weights = {
         "image": s.image_weight, "reward": s.reward_weight, "termination": s.termination_weight,
         "kl": s.kl_weight, "kl_standard": s.kl_standard_weight, "jeffreys": s.jeffreys_weight,
@@ -205,15 +206,11 @@ def update(
 
 def as_numbers(metrics: dict[str, Tensor]) -> dict[str, float]:
     """Metrics as numbers, by one wait for the device. A FloatingPointError if one is not finite."""
-    numbers = dict(zip(metrics, stacked(metrics).tolist(), strict=True))
+    values = torch.stack([value.detach().float() for value in metrics.values()])
+    numbers = dict(zip(metrics, values.tolist(), strict=True))
     if wrong := [name for name, number in numbers.items() if not math.isfinite(number)]:
         raise FloatingPointError(f"Not finite: {', '.join(wrong)}.")
     return numbers
-
-
-def stacked(metrics: dict[str, Tensor]) -> Tensor:
-    """(M,) metrics, where they were computed."""
-    return torch.stack([value.detach().float() for value in metrics.values()])
 
 
 @torch.no_grad()
@@ -224,11 +221,6 @@ def reward_r2(agent: "Agent", states: Tensor, batch: dict[str, Tensor]) -> Tenso
     error = (weight * (agent.model.predict_reward(states) - reward).square()).sum()
     variance = (weight * (reward - (weight * reward).sum()).square()).sum()
     return 1 - error / variance.clamp(min=1e-6)
-
-
-def live_rows(batch: dict[str, Tensor]) -> Tensor:
-    """Which of a batch's B · T rows are no ends, where nothing follows."""
-    return (~batch["terminated"]).flatten().nonzero().squeeze(1)
 
 
 def dream_starts(states: Tensor, live: Tensor, share: float) -> Tensor:
@@ -313,7 +305,8 @@ def train(run: "Run", stop: Callable[[], bool]) -> None:
     """
     s, agent, env, replay = run.s, run.agent, run.env, run.replay
     while not any(gathered(stop())):
-        if run.updates < updates_due(run.step, s):
+        # `updates` of them belong before each multiple of `train_every` from `prefill` on.
+        if run.updates < s.updates * passed(s.prefill - 1, run.step, s.train_every):
             rows = replay.sample(s.batch_size // processes(), s.length, run.rng)
             batch, beta = to_tensors(rows, agent.device), beta_at(run.step, s)
             began = time.monotonic()
@@ -342,12 +335,6 @@ def train(run: "Run", stop: Callable[[], bool]) -> None:
             break
         run.save_if_due()
     run.save()
-
-
-def updates_due(step: int, s: Settings) -> int:
-    """Updates that belong before the decision at an environment step: `updates` of them at each
-    multiple of `train_every` from `prefill` on."""
-    return s.updates * max(0, passed(s.prefill - 1, step, s.train_every))
 
 
 def passed(before: int, after: int, every: int) -> int:
@@ -421,10 +408,8 @@ class Agent(nn.Module):
             learners[f"{name}_actor"] = actor, s.actor_lr
             learners[f"{name}_critic"] = critic, s.critic_lr
         if s.entropy and s.density == "mdn":
-            sizes = size, s.mdn_components, s.mdn_units, s.mdn_min_std
-            self.mdn, self.target_mdn = (MixtureDensityNetwork(*sizes) for _ in range(2))
-            self.target_mdn.load_state_dict(self.mdn.state_dict())
-            self.target_mdn.requires_grad_(False)
+            self.mdn = MixtureDensityNetwork(size, s.mdn_components, s.mdn_units, s.mdn_min_std)
+            self.target_mdn = copy.deepcopy(self.mdn).requires_grad_(False)
             learners["mdn"] = self.mdn, s.mdn_lr
         self.to(device)
         self.optimisers = {
@@ -461,14 +446,13 @@ class Agent(nn.Module):
         norm = nn.utils.clip_grad_norm_(parameters, self.s.grad_clip)
         metrics[f"{name}/grad_norm"] = norm + 0 * loss
         # Where it is 1 a fused optimiser does nothing; to ask here would wait for the device.
-        norms = {key: value for key, value in metrics.items() if key.endswith("grad_norm")}
-        optimiser.found_inf = (~stacked(norms).isfinite().all()).float()
+        norms = torch.stack([value for key, value in metrics.items() if key.endswith("grad_norm")])
+        optimiser.found_inf = (~norms.isfinite().all()).float()
         optimiser.step()
 
     def follow(self) -> None:
         """Move the averages that follow what learns: the players, and the target MDN (§4.1)."""
-        for name, player in self.players.items():
-            soft_update(player, self.actors[name], self.s.play_rate)
+        soft_update(self.players, self.actors, self.s.play_rate)
         if self.s.entropy and self.s.density == "mdn":
             soft_update(self.target_mdn, self.mdn, self.s.target_rate)
 
@@ -527,17 +511,6 @@ def average_over_processes(tensors: list[Tensor], count: int) -> None:
         x.copy_(mean.view_as(x))
 
 
-def unsaved(s: Settings) -> int:
-    """Rows of experience after which the next checkpoint is due."""
-    return min(500, s.replay_capacity)
-
-
-def replay_in(folder: Path, s: Settings, actions: int) -> Replay:
-    """A process's replay. A checkpoint needs its window of the ring whole until two more are
-    written."""
-    return Replay(s.replay_capacity, actions, folder / "replay.bin", 3 * unsaved(s))
-
-
 class Run:
     """All that a run is: environments, agent, replay, random states, counters, and its folder.
 
@@ -548,7 +521,7 @@ class Run:
     """
 
     KEPT = (
-        "step", "updates", "episode", "length", "over", "state", "actions", "visited", "averages",
+        "step", "updates", "episode", "length", "over", "state", "actions", "visited", "metrics",
         "rows", "evaluated_at", "best", "seconds", "saved_rows", "machine",
     )  # fmt: skip
 
@@ -566,7 +539,7 @@ class Run:
         self.state: Tensor | None = None  # (1, D), the agent's; None: it has not looked yet
         self.actions: list[list[float]] = []  # of the episode under way
         self.visited: list[list[float]] = []  # the environment's own, since the last evaluation
-        self.averages: dict[str, list[float]] = {}  # name: [sum, count] since then
+        self.metrics: list[dict[str, float]] = []  # of updates and whole episodes, since then
         self.rows: list[dict[str, str]] = []  # of metrics.csv
         self.evaluated_at, self.best = 0, -float("inf")  # step of the last one; best mean return
         self.seconds, self.clock = 0.0, time.monotonic()  # taken until the last checkpoint; then
@@ -587,7 +560,8 @@ class Run:
         except filelock.Timeout:
             who = f"process {owner.read_text()}" if owner.exists() else "another process"
             raise ValueError(f"{self.folder} is in use by {who}: stop it or wait for it.") from None
-        self.replay = replay_in(self.own, self.s, self.env.action_space.shape[0])
+        actions = self.env.action_space.shape[0]
+        self.replay = Replay(self.s.replay_capacity, actions, self.own / "replay.bin")
 
     def sign(self) -> None:
         """Say in the folder what its experiment is, and which process goes on with it."""
@@ -616,8 +590,8 @@ class Run:
         self.actions.append(action.tolist())  # of numbers: 50,000 tensors take seconds to save
         self.visited.append(info["state"].tolist())
         if over:
-            whole = info["episode"]
-            self.average({"train_return": whole["r"], "train_length": whole["l"]})
+            total, length = (float(info["episode"][name]) for name in "rl")
+            self.metrics.append({"train_return": total, "train_length": length})
         self.bar.update(self.step - self.bar.n)
 
     def note_update(self, metrics: dict[str, float]) -> None:
@@ -626,13 +600,7 @@ class Run:
             for name, value in metrics.items():
                 self.writer.add_scalar(f"update/{name}", value, self.step)
         self.updates += 1
-        self.average(metrics)
-
-    def average(self, metrics: dict[str, float]) -> None:
-        """Take metrics into the averages of the next row of metrics.csv."""
-        for name, value in metrics.items():
-            whole, count = self.averages.get(name, (0.0, 0))
-            self.averages[name] = [whole + float(value), count + 1]
+        self.metrics.append(metrics)
 
     def evaluation_due(self) -> bool:
         """Whether a multiple of `eval_every`, or the end, was passed since the last evaluation."""
@@ -643,23 +611,23 @@ class Run:
     def report(self, episodes: list[Episode]) -> None:
         """A row of metrics.csv and TensorBoard, a line, and best.pt if none was better."""
         self.evaluated_at = self.step
-        own = [(e.total, e.length) for e in episodes], self.visited, self.averages
-        scores, visited, averages = zip(*gathered(own), strict=True)
+        own = [(e.total, e.length) for e in episodes], self.visited, self.metrics
+        scores, visited, metrics = zip(*gathered(own), strict=True)
         if not any(scores):
             return
-        self.averages, self.visited = {}, []
+        self.metrics, self.visited = [], []
         if rank():
             return
         returns, lengths = np.concatenate([each for each in scores if each]).T
-        names = dict.fromkeys(name for each in averages for name in each)
-        sums = {n: np.sum([each[n] for each in averages if n in each], 0) for n in names}
+        made = [one for each in metrics for one in each]
+        names = dict.fromkeys(name for one in made for name in one)
         row = {
             "env_steps": self.step, "wall_seconds": self.elapsed(),
             "eval_return": returns.mean(), "eval_interval95": interval95(returns),
             "eval_length": lengths.mean(), "eval_length_min": lengths.min(),
             "eval_length_max": lengths.max(), "coverage": coverage(np.concatenate(visited)),
             "train_return": float("nan"), "train_length": float("nan"),  # unless an episode ended
-        } | {name: whole / count for name, (whole, count) in sums.items()}  # fmt: skip
+        } | {n: np.mean([one[n] for one in made if n in one]) for n in names}  # fmt: skip
         self.rows.append({k: str(v) if k == "env_steps" else f"{v:.6g}" for k, v in row.items()})
         table = io.StringIO()
         writer = csv.DictWriter(table, dict.fromkeys(k for row in self.rows for k in row), "nan")
@@ -687,7 +655,7 @@ class Run:
     def save_if_due(self) -> None:
         """Write a checkpoint every `checkpoint_minutes`, and before the ring's reserve is full."""
         waited = time.monotonic() - self.clock >= 60 * self.s.checkpoint_minutes
-        if any(gathered(waited or self.replay.added - self.saved_rows >= unsaved(self.s))):
+        if any(gathered(waited or self.replay.added - self.saved_rows >= self.replay.unsaved)):
             self.save()
 
     def save(self) -> None:
@@ -982,7 +950,7 @@ def main(arguments: list[str]) -> int:
     except (ValueError, OSError, MemoryError) as error:
         say(error)
         return 2
-    with run.lock:
+    with run.lock, run.replay.file:
         return train_run(run)
 
 

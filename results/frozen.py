@@ -41,7 +41,7 @@ def frozen(folder: Path, like: train.Command, seed: int) -> tuple[gym.Env, train
     agent = train.make_agent(s, env, like.device, like.precision)
     of_model = (item for item in saved["agent"].items() if item[0].startswith("model."))
     take(agent.model, {name.removeprefix("model."): x for name, x in of_model})
-    replay = train.replay_in(folder, s, env.action_space.shape[0])
+    replay = Replay(s.replay_capacity, env.action_space.shape[0], folder / "replay.bin")
     replay.restore(saved["kept"]["saved_rows"], saved["checksums"].numpy())
     return env, agent, replay
 
@@ -62,7 +62,8 @@ def learn(command: argparse.Namespace, settings: list[str]) -> None:
         batch = train.to_tensors(replay.sample(s.batch_size, s.length, rng), agent.device)
         with torch.no_grad(), agent.autocast():
             seen = agent.model.observe(batch["image"], batch["action"], batch["is_first"])
-        starts = train.dream_starts(seen.state, train.live_rows(batch), s.starts)
+        live = (~batch["terminated"]).flatten().nonzero().squeeze(1)  # rows that are no ends
+        starts = train.dream_starts(seen.state, live, s.starts)
         train.update_actor(agent, name, starts, s.beta_start, s, metrics := {}, updates % 50 == 1)
         promised.append(train.as_numbers(metrics)[f"{name}_actor/return"])
         agent.follow()

@@ -290,7 +290,7 @@ def test_a_run_whose_replay_has_wrapped_around_can_be_resumed(tmp_path):
     folder = tmp_path / "run"
     process = start("--run-dir", folder, *ring)
     rows = 0
-    while rows <= 110:  # the ring holds 95: the 20 that are sampled, three times 20 + 5 in reserve
+    while rows <= 110:  # the ring holds 80: the 20 that are sampled, three times 20 in reserve
         time.sleep(0.01)
         if written(folder):
             rows = read_checkpoint(folder)[1]["kept"]["saved_rows"]
