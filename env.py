@@ -278,8 +278,8 @@ def coverage(states: np.ndarray, k: int = 3) -> float:
 
 
 class Replay:
-    """A ring of rows of experience in a file, sampled as windows of consecutive rows: records in
-    one array. The file is written to, and mapped to be read: its memory is the page cache's.
+    """A ring of rows of experience in a file, sampled as windows of consecutive rows. Its memory is
+    the page cache's.
 
     Args:
         capacity: newest rows that are sampled; older ones are overwritten.
@@ -350,5 +350,6 @@ class Replay:
         if len(self) < length:
             raise ValueError(f"The replay holds {len(self)} rows, fewer than a window of {length}.")
         first = self.added - len(self) + rng.integers(len(self) - length + 1, size=batch)
-        rows = np.memmap(self.file, self.dtype, "r", shape=min(self.added, self.ring))
-        return np.asarray(rows)[(first[:, None] + np.arange(length)) % self.ring]
+        numbers = first[:, None] + np.arange(length)
+        rows = bytearray().join(map(self.read, numbers.flat))
+        return np.frombuffer(rows, self.dtype).reshape(numbers.shape)

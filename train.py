@@ -96,7 +96,7 @@ class Settings:
     deterministic_actor: bool = True  # §4.1: train a deterministic actor too, and evaluate it
     action_noise: Amount = 0.0  # std of noise on actions the explorer collects (Dreamer: 0.3)
     random_action: Share = 0.1  # §4.2 minor 4: how often the explorer acts at random (value ours)
-    collect: Collect = "explorer"  # who collects; both: the evaluated actor too, in turn (ours)
+    collect: Collect = "explorer"  # who collects; both: the evaluated actor too, as much (ours)
 
     deter: Size = 200  # size of h (Dreamer: 200)
     stoch: Size = 128  # size of z (§5: 128; Dreamer: 30)
@@ -105,6 +105,8 @@ class Settings:
     depth: Size = 32  # channels of the first convolution (Dreamer: 32)
     batch_size: Size = 50  # sequences a batch (Dreamer: 50)
     length: Annotated[Size, Interval(ge=2)] = 50  # rows a sequence (Dreamer: 50)
+    burn_in: Whole = 0  # rows of one begun mid-episode: no reward, end or dream is of them (ours)
+    heads_ahead: bool = False  # learn rewards and ends where dreams meet them too, z ~ prior (ours)
     decode_share: Share = 1.0  # of a batch's images, those that are decoded (Dreamer: all)
     horizon: Size = 15  # imagined steps, and n of Eq. (10) (Dreamer)
     starts: Share = 1.0  # of a batch's live states, those that actors dream on from (Dreamer: all)
@@ -119,7 +121,7 @@ class Settings:
     mdn_units: Size = 256  # its hidden units (§5: 256)
     mdn_min_std: Amount = 0.1  # floor under its σ (ours)
     target_rate: Share = 0.1  # soft update of the target MDN (§5)
-    dream_noise: Amount = 0.0  # std of noise on the evaluated actor's imagined actions (ours)
+    dream_noise: Amount = 0.0  # std of noise on imagined actions (ours)
     detach_policy: bool = True  # no gradient through what the policy sees in its dream (Dreamer)
     action_penalty: Amount = 0.0  # on actions squared before their tanh, lest it saturate (ours)
     model_lr: Amount = 6e-4  # Adam's learning rate of the world model (Dreamer)
@@ -156,9 +158,10 @@ PRESETS = {
     "small": dict(  # sizes and cadence for two CPU cores, and what results/trials.md found to help
         deter=128, stoch=64, hidden=128, units=128, depth=16, batch_size=20, length=25,
         mdn_units=128, prefill=2000, starts=0.5, floor_brightness=0.4, reward_weight=20.0,
-        squared_reward=True, smooth_l1=False, termination_weight=1.0, action_penalty=0.01,
-        critic_lr=5e-4, critic_norm=True, actor_lr=2e-4, horizon=10, play_rate=0.01,
-        decode_share=0.25, dream_noise=0.3, collect="both",
+        squared_reward=True, smooth_l1=False, termination_weight=100.0, heads_ahead=True, burn_in=2,
+        action_penalty=0.01, critic_lr=5e-4, critic_norm=True, actor_lr=2e-4, horizon=10,
+        play_rate=0.01, decode_share=0.25, dream_noise=0.3, collect="both", action_noise=0.3,
+        random_action=0.01,
     ),
     "paper": dict(steps=1_000_000, train_every=1000, updates=100),
 }
@@ -184,8 +187,8 @@ def update(
         named metrics; the world model's are the unweighted terms of its loss. A FloatingPointError
         names those that are not finite; from the first such gradient on, nothing was changed.
     """
-    # Rows that are no ends. Asked for first: a GPU has nothing under way that this waits for.
-    live = (~batch["terminated"]).flatten().nonzero().squeeze(1)
+    # Asked for first: a GPU has nothing under way that this waits for.
+    live = live_rows(agent, batch)
     weights = {
         "image": s.image_weight, "reward": s.reward_weight, "termination": s.termination_weight,
         "kl": s.kl_weight, "kl_standard": s.kl_standard_weight, "jeffreys": s.jeffreys_weight,
@@ -216,11 +219,18 @@ def as_numbers(metrics: dict[str, Tensor]) -> dict[str, float]:
 @torch.no_grad()
 def reward_r2(agent: "Agent", states: Tensor, batch: dict[str, Tensor]) -> Tensor:
     """The share of the variance of a batch's rewards that its states (B, T, D) predict."""
-    arrived, reward = (~batch["is_first"]).float(), batch["reward"]
-    weight = arrived / arrived.sum().clamp(min=1)
+    first, reward = batch["is_first"], batch["reward"]
+    weight = (agent.model.settled(first) & ~first).float()
+    weight /= weight.sum().clamp(min=1)
     error = (weight * (agent.model.predict_reward(states) - reward).square()).sum()
     variance = (weight * (reward - (weight * reward).sum()).square()).sum()
     return 1 - error / variance.clamp(min=1e-6)
+
+
+def live_rows(agent: "Agent", batch: dict[str, Tensor]) -> Tensor:
+    """Which of a batch's B · T rows dreams may start from: settled ones that are no ends."""
+    live = agent.model.settled(batch["is_first"]) & ~batch["terminated"]
+    return live.flatten().nonzero().squeeze(1)
 
 
 def dream_starts(states: Tensor, live: Tensor, share: float) -> Tensor:
@@ -266,14 +276,13 @@ def update_actor(
 
 
 def dreaming(agent: "Agent", name: str, s: Settings) -> Callable[[Tensor], Tensor]:
-    """What an actor does in its dreams, states (N, D) to actions (N, A): with `detach_policy` no
-    gradient leaves through what it sees; if it is the evaluated one it acts with `dream_noise`."""
+    """What an actor does in its dreams, states (N, D) to actions (N, A), with `dream_noise`: with
+    `detach_policy` no gradient leaves through what it sees."""
     actor = agent.actors[name]
-    noise = s.dream_noise if agent.players[name] is agent.evaluated else 0.0
 
     def policy(state: Tensor) -> Tensor:
         action = actor(state.detach() if s.detach_policy else state)
-        return nudge(action, noise) if noise else action
+        return nudge(action, s.dream_noise) if s.dream_noise else action
 
     return policy
 
@@ -321,10 +330,10 @@ def train(run: "Run", stop: Callable[[], bool]) -> None:
             if run.step < s.prefill:
                 action = run.rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
             else:
-                last, explores = replay.last, agent.explores(run.episode, run.length)
-                policy = agent.players["stochastic"] if explores else agent.evaluated.mode
+                last = replay.last
+                policy = agent.players["stochastic"] if run.explores else agent.evaluated.mode
                 action, run.state = act(agent, policy, last["image"], last["action"], run.state)
-                if explores:
+                if run.explores:
                     action = explore(action, s.action_noise, s.random_action, run.rng)
             image, reward, terminated, truncated, info = env.step(action)
             replay.add(image, action, reward, terminated)
@@ -375,9 +384,6 @@ def interval95(returns: np.ndarray) -> float:
     return float(stats.t.ppf(0.975, len(returns) - 1) * stats.sem(returns))
 
 
-TURN = 1000  # environment steps, the length of a robot's whole episode
-
-
 class Agent(nn.Module):
     """All networks of a run with A actions, and one Adam for each that learns."""
 
@@ -389,7 +395,8 @@ class Agent(nn.Module):
             termination=s.termination, fixed_prior=s.fixed_prior,
             smooth_l1=s.smooth_l1 and not s.squared_reward,
             decode_stoch_only=s.decode_stoch_only, decode_share=s.decode_share,
-            observe_first=s.observe_first, free_nats=s.free_nats,
+            burn_in=s.burn_in, heads_ahead=s.heads_ahead, observe_first=s.observe_first,
+            free_nats=s.free_nats,
         )  # fmt: skip
         size = self.model.size
         self.actors = nn.ModuleDict({"stochastic": actors.StochasticActor(size, actions, s.units)})
@@ -421,12 +428,6 @@ class Agent(nn.Module):
     def evaluated(self) -> nn.Module:
         """The actor that evaluation plays: the deterministic one if there is one (§4.1)."""
         return self.players["deterministic" if self.s.deterministic_actor else "stochastic"]
-
-    def explores(self, episode: int, length: int) -> bool:
-        """Whether the explorer takes the next decision of training, so many environment steps into
-        an episode, or the evaluated actor, undisturbed: in turn, an episode each, of a longer one
-        TURN steps."""
-        return self.s.collect == "explorer" or (episode + length // TURN) % 2 == 0
 
     def autocast(self) -> torch.autocast:
         """Matrix products and convolutions in bfloat16. A context holds the weights it has cast,
@@ -511,6 +512,9 @@ def average_over_processes(tensors: list[Tensor], count: int) -> None:
         x.copy_(mean.view_as(x))
 
 
+TURN = 1000  # environment steps, the length of a robot's whole episode
+
+
 class Run:
     """All that a run is: environments, agent, replay, random states, counters, and its folder.
 
@@ -521,8 +525,8 @@ class Run:
     """
 
     KEPT = (
-        "step", "updates", "episode", "length", "over", "state", "actions", "visited", "metrics",
-        "rows", "evaluated_at", "best", "seconds", "saved_rows", "machine",
+        "step", "updates", "episode", "length", "over", "explores", "lead", "state", "actions",
+        "visited", "metrics", "rows", "evaluated_at", "best", "seconds", "saved_rows", "machine",
     )  # fmt: skip
 
     def __init__(self, s: Settings, folder: Path, device: str = "auto", precision: str = "auto"):
@@ -536,10 +540,11 @@ class Run:
             dist.broadcast(value, 0)
         self.step = self.updates = self.episode = 0  # made; made; begun
         self.over, self.length = True, 0  # whether the last episode ended; its environment steps
+        self.explores, self.lead = True, 0  # who collects; by how many steps the explorer is ahead
         self.state: Tensor | None = None  # (1, D), the agent's; None: it has not looked yet
         self.actions: list[list[float]] = []  # of the episode under way
         self.visited: list[list[float]] = []  # the environment's own, since the last evaluation
-        self.metrics: list[dict[str, float]] = []  # of updates and whole episodes, since then
+        self.metrics: dict[str, list[float]] = {}  # of updates and whole episodes, since then
         self.rows: list[dict[str, str]] = []  # of metrics.csv
         self.evaluated_at, self.best = 0, -float("inf")  # step of the last one; best mean return
         self.seconds, self.clock = 0.0, time.monotonic()  # taken until the last checkpoint; then
@@ -575,7 +580,13 @@ class Run:
         """Go on to the next episode: its first image."""
         self.episode += 1
         self.over, self.length, self.state, self.actions = False, 0, None, []
+        self.take_turn()
         return self.reset()
+
+    def take_turn(self) -> None:
+        """Of the explorer and, undisturbed, the evaluated actor, whoever has collected less
+        collects next, for an episode, of a longer one for TURN environment steps."""
+        self.explores = self.s.collect == "explorer" or self.lead <= 0
 
     def reset(self) -> np.ndarray:
         """The first image of the present episode, whose seed is its own."""
@@ -587,11 +598,14 @@ class Run:
         """Count a decision that was taken."""
         before, self.length = self.length, int(self.env.get_wrapper_attr("episode_lengths"))
         self.step, self.over = self.step + sum(gathered(self.length - before)), over
+        self.lead += (self.length - before) * (1 if self.explores else -1)
+        if passed(before, self.length, TURN):
+            self.take_turn()
         self.actions.append(action.tolist())  # of numbers: 50,000 tensors take seconds to save
         self.visited.append(info["state"].tolist())
         if over:
-            total, length = (float(info["episode"][name]) for name in "rl")
-            self.metrics.append({"train_return": total, "train_length": length})
+            whole = info["episode"]
+            self.note({"train_return": whole["r"], "train_length": whole["l"]})
         self.bar.update(self.step - self.bar.n)
 
     def note_update(self, metrics: dict[str, float]) -> None:
@@ -600,7 +614,12 @@ class Run:
             for name, value in metrics.items():
                 self.writer.add_scalar(f"update/{name}", value, self.step)
         self.updates += 1
-        self.metrics.append(metrics)
+        self.note(metrics)
+
+    def note(self, metrics: dict[str, float]) -> None:
+        """Keep metrics for the means in the next row of metrics.csv."""
+        for name, value in metrics.items():
+            self.metrics.setdefault(name, []).append(float(value))
 
     def evaluation_due(self) -> bool:
         """Whether a multiple of `eval_every`, or the end, was passed since the last evaluation."""
@@ -615,19 +634,19 @@ class Run:
         scores, visited, metrics = zip(*gathered(own), strict=True)
         if not any(scores):
             return
-        self.metrics, self.visited = [], []
+        self.metrics, self.visited = {}, []
         if rank():
             return
         returns, lengths = np.concatenate([each for each in scores if each]).T
-        made = [one for each in metrics for one in each]
-        names = dict.fromkeys(name for one in made for name in one)
+        names = dict.fromkeys(name for each in metrics for name in each)
+        lists = {n: np.concatenate([each[n] for each in metrics if n in each]) for n in names}
         row = {
             "env_steps": self.step, "wall_seconds": self.elapsed(),
             "eval_return": returns.mean(), "eval_interval95": interval95(returns),
             "eval_length": lengths.mean(), "eval_length_min": lengths.min(),
             "eval_length_max": lengths.max(), "coverage": coverage(np.concatenate(visited)),
             "train_return": float("nan"), "train_length": float("nan"),  # unless an episode ended
-        } | {n: np.mean([one[n] for one in made if n in one]) for n in names}  # fmt: skip
+        } | {name: numbers.mean() for name, numbers in lists.items()}  # fmt: skip
         self.rows.append({k: str(v) if k == "env_steps" else f"{v:.6g}" for k, v in row.items()})
         table = io.StringIO()
         writer = csv.DictWriter(table, dict.fromkeys(k for row in self.rows for k in row), "nan")
@@ -853,10 +872,11 @@ def check(text: str, where: str = "") -> Settings:
         raise ValueError(f"{where}{wrong['msg']}.") from None
     n, least = processes(), s.prefill + s.train_every
     rows = s.prefill // s.action_repeat // n
-    live = s.starts * s.batch_size * (s.length // 2) / n  # states that are no ends, at least
+    live = s.starts * s.batch_size * ((s.length - s.burn_in) // 2) / n  # that are no ends, at least
     enough = s.density != "knn" or live >= 4
     for possible, sentence in (
         (s.batch_size % n == 0, f"--batch-size {s.batch_size} is no multiple of {n} processes"),
+        (s.burn_in <= s.length - 2, f"--burn-in leaves fewer than two rows of --length {s.length}"),
         (s.length <= rows, f"--prefill {s.prefill} makes {rows} rows, no --length {s.length}"),
         (s.length <= s.replay_capacity, f"--replay-capacity is less than --length {s.length}"),
         (s.steps >= least, f"--steps {s.steps} leaves no update after --prefill: give {least}"),

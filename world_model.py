@@ -194,6 +194,10 @@ class WorldModel(nn.Module):
         smooth_l1: Smooth L1 loss of the reward (§4.2, minor 2), in the place of ½(r − r')².
         decode_stoch_only: the decoder sees z alone (§4.2, minor 3), in the place of (h, z).
         decode_share: of a batch's images, those that are decoded, drawn at random (ours).
+        burn_in: first rows of a sequence that begins within an episode, whose h does not hold what
+            came before: they teach no reward and no end (ours; the idea is R2D2's).
+        heads_ahead: rewards and ends are learnt in (h, z ~ prior) too, where dreams ask for them
+            (ours).
         observe_first: z_0 is inferred from o_0, so a_0 depends on it (§4.2). Without it s_0 is
             zero and o_0 is never seen.
         free_nats: KL below which there is nothing to gain (Dreamer); with `fixed_prior` unused.
@@ -202,13 +206,13 @@ class WorldModel(nn.Module):
     def __init__(
         self, actions: int, *, deter: int, stoch: int, hidden: int, units: int, depth: int,
         termination: bool, fixed_prior: bool, smooth_l1: bool, decode_stoch_only: bool,
-        decode_share: float, observe_first: bool, free_nats: float,
+        decode_share: float, burn_in: int, heads_ahead: bool, observe_first: bool, free_nats: float,
     ):  # fmt: skip
         super().__init__()
         self.deter, self.stoch, self.size = deter, stoch, deter + stoch
         self.fixed_prior, self.smooth_l1, self.free_nats = fixed_prior, smooth_l1, free_nats
         self.decode_stoch_only, self.observe_first = decode_stoch_only, observe_first
-        self.decode_share = decode_share
+        self.decode_share, self.burn_in, self.heads_ahead = decode_share, burn_in, heads_ahead
         self.encoder = Encoder(depth)
         # One dense layer on (z, a), in two parts: the action's needs no recurrence.
         self.dense_stoch = nn.Linear(stoch, hidden, bias=False)
@@ -265,6 +269,13 @@ class WorldModel(nn.Module):
         state = torch.cat([deter, torch.stack(stochs, 1)], -1)
         return Observed(state, normal(torch.stack(statistics, 1)), normal(self.prior_net(deter)))
 
+    def settled(self, is_first: Tensor) -> Tensor:
+        """Which rows of sequences (B, T) the states know enough of, bool: those whose episode began
+        in the sequence, and of others all but the first `burn_in`."""
+        known = is_first.cumsum(1) > 0
+        known[:, self.burn_in :] = True
+        return known
+
     def imagine(self, start: Tensor, policy: Callable[[Tensor], Tensor], horizon: int) -> Dream:
         """H steps from N states through the prior, differentiable in the policy's actions.
 
@@ -306,8 +317,9 @@ class WorldModel(nn.Module):
         """The loss as named, unweighted means over batch and time: Eqs. (3), (4) and §4.2.
 
             image        ½ Σ (o − o')² over pixels; of `decode_share` of the images
-            reward       Smooth L1, or ½ (r − r')²; first rows arrive with none
+            reward       Smooth L1, or ½ (r − r')²; of settled rows; first ones have none
             termination  binary cross-entropy on `terminated`, never on `truncated`; likewise
+                         both: in (h, z ~ posterior), and with `heads_ahead` in (h, z ~ prior) too
             kl_standard  KL(posterior ‖ N(0, 1)), which gives the prior no gradient (§4.2)
             jeffreys     KL(posterior ‖ prior) + KL(prior ‖ posterior) (§4.2)
             kl           max(KL(posterior ‖ prior), free nats), Dreamer's, in place of the last two
@@ -324,23 +336,35 @@ class WorldModel(nn.Module):
         observed = self.observe(batch["image"], batch["action"], batch["is_first"])
         arrived = (~batch["is_first"]).float()
         seen = torch.ones_like(arrived) if self.observe_first else arrived
+        taught = arrived * self.settled(batch["is_first"])
         some = share_of(seen.numel(), self.decode_share, seen.device)
         z, pixels = self.decoded(observed.state).flatten(0, 1), batch["image"].flatten(0, 1)
         image = self.decoder.nll(z[some], pixels[some])
-        pair = self.predict_reward(observed.state), batch["reward"]
+        terms = {"image": masked_mean(image, seen.flatten()[some])}
+        terms |= self.head_losses(observed.state, batch, taught)
+        if self.heads_ahead:
+            deter = observed.state[..., : self.deter]
+            dreamt = torch.cat([deter, observed.prior.rsample()], -1)
+            for name, term in self.head_losses(dreamt, batch, taught).items():
+                terms[name] = terms[name] + term
+        return terms | self.divergences(observed.posterior, observed.prior, seen), observed.state
+
+    def head_losses(
+        self, state: Tensor, batch: dict[str, Tensor], taught: Tensor
+    ) -> dict[str, Tensor]:
+        """The terms reward and termination of `loss` in states (B, T, D), of rows where `taught`
+        (B, T) is 1."""
+        pair = self.predict_reward(state), batch["reward"]
         if self.smooth_l1:
             loss = F.smooth_l1_loss(*pair, reduction="none")
         else:
             loss = 0.5 * F.mse_loss(*pair, reduction="none")
-        terms = {
-            "image": masked_mean(image, seen.flatten()[some]),
-            "reward": masked_mean(loss, arrived),
-        }
+        terms = {"reward": masked_mean(loss, taught)}
         if self.termination is not None:
-            logit, terminated = self.termination(observed.state).squeeze(-1), batch["terminated"]
+            logit, terminated = self.termination(state).squeeze(-1), batch["terminated"]
             loss = F.binary_cross_entropy_with_logits(logit, terminated.float(), reduction="none")
-            terms["termination"] = masked_mean(loss, arrived)
-        return terms | self.divergences(observed.posterior, observed.prior, seen), observed.state
+            terms["termination"] = masked_mean(loss, taught)
+        return terms
 
     def divergences(self, posterior: Normal, prior: Normal, seen: Tensor) -> dict[str, Tensor]:
         """The terms of `loss` that hold the posterior to the prior, in nats, summed over z."""

@@ -62,8 +62,7 @@ def learn(command: argparse.Namespace, settings: list[str]) -> None:
         batch = train.to_tensors(replay.sample(s.batch_size, s.length, rng), agent.device)
         with torch.no_grad(), agent.autocast():
             seen = agent.model.observe(batch["image"], batch["action"], batch["is_first"])
-        live = (~batch["terminated"]).flatten().nonzero().squeeze(1)  # rows that are no ends
-        starts = train.dream_starts(seen.state, live, s.starts)
+        starts = train.dream_starts(seen.state, train.live_rows(agent, batch), s.starts)
         train.update_actor(agent, name, starts, s.beta_start, s, metrics := {}, updates % 50 == 1)
         promised.append(train.as_numbers(metrics)[f"{name}_actor/return"])
         agent.follow()

@@ -22,6 +22,7 @@ import torch
 from gymnasium.envs.registration import EnvSpec
 
 import actors
+import train
 from train import ARMS, Agent, Settings, has_bfloat16, main, read_checkpoint
 
 TRAIN = Path(__file__).parent.parent / "train.py"
@@ -136,11 +137,11 @@ def test_coverage_is_of_the_rows_since_the_last_evaluation(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize("arm, collect, turn, turns, noise", [
-    ("maxent", "both", 1000, "AA EEEE AAAA EEEE", 0),
+    ("maxent", "both", 1000, "EE AAAA EEEE AAAA", 0),
     ("maxent", "explorer", 1000, "EE EEEE EEEE EEEE", 0),
-    ("revised", "both", 1000, "AA EEEE AAAA EEEE", 0.3),
+    ("revised", "both", 1000, "EE AAAA EEEE AAAA", 0.3),
     ("revised", "explorer", 1000, "EE EEEE EEEE EEEE", 0.3),
-    ("maxent", "both", 4, "EE EEAA AAEE EEAA", 0),  # as in episodes longer than a turn
+    ("maxent", "both", 4, "AA AAEE EEAA AAEE", 0),  # as in episodes longer than a turn
 ])  # fmt: skip
 def test_only_the_explorers_actions_are_disturbed(
     arm, collect, turn, turns, noise, tmp_path, monkeypatch, numpy_env
@@ -168,6 +169,41 @@ def test_only_the_explorers_actions_are_disturbed(
         disturbed = [False, *(who == "E" for who in episode[:-1])]
         expected += zip(episode, disturbed, strict=True)
     assert seen[: len(expected)] == expected
+
+
+def test_an_explorer_that_falls_at_once_collects_as_much_as_what_is_evaluated(
+    tmp_path, monkeypatch, numpy_env
+):
+    def step(env, action):
+        image, reward, over, *rest = unhurt(env, action)
+        return image, reward, over or np.bool_(env.explored), *rest
+
+    def exploring(action, *_):
+        NumPyEnv.explored = True
+        return action
+
+    def acting(*given):
+        NumPyEnv.explored = False
+        return actors.act(*given)
+
+    unhurt, taken = NumPyEnv.step, {True: 0, False: 0}
+    noted = train.Run.note_decision
+
+    def noting(run, *given):
+        before, explores = run.step, run.explores
+        noted(run, *given)
+        taken[explores] += run.step - before
+        assert run.lead == taken[True] - taken[False] and -7 < run.lead <= 7
+
+    NumPyEnv.explored = False
+    monkeypatch.setattr(NumPyEnv, "step", step)
+    monkeypatch.setattr("train.act", acting)
+    monkeypatch.setattr("train.explore", exploring)
+    monkeypatch.setattr("train.Run.note_decision", noting)
+    folder = str(tmp_path / "run")
+    arguments = ["--env", "NumPy-v0", "--steps", "140", "--collect", "both", "--run-dir", folder]
+    assert main([*arguments, *TINY]) == 0
+    assert min(taken.values()) > 60
 
 
 # ---- runs that are never lost --------------------------------------------------------------------
@@ -284,6 +320,34 @@ def test_a_run_without_a_whole_checkpoint_is_refused_and_left_as_it_is(tmp_path)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
+def test_whose_turn_it_is_is_resumed(tmp_path, monkeypatch, numpy_env):
+    monkeypatch.setattr("train.TURN", 4)  # of an episode's seven steps
+    folder, noted, load = tmp_path / "run", train.Run.note_decision, train.Run.load
+    turns = []
+
+    def noting(run, *given):
+        noted(run, *given)
+        if not run.explores and run.length == 6:
+            run.save()
+            turns.append((run.step, run.lead))
+            raise KeyboardInterrupt
+
+    def loading(run):
+        load(run)
+        assert not run.explores
+        turns.append((run.step, run.lead))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("train.Run.note_decision", noting)
+    arguments = ["--env", "NumPy-v0", "--steps", "140", "--collect", "both"]
+    with pytest.raises(KeyboardInterrupt):
+        main([*arguments, "--run-dir", str(folder), *TINY])
+    monkeypatch.setattr("train.Run.load", loading)
+    with pytest.raises(KeyboardInterrupt):
+        main(["--resume", str(folder)])
+    assert turns[0] == turns[1] and turns[0][1] != 0
+
+
 def test_a_run_whose_replay_has_wrapped_around_can_be_resumed(tmp_path):
     ring = ["--steps", 400, "--eval-every", 200, "--replay-capacity", 20, *TINY]
     assert run("--run-dir", tmp_path / "whole", *ring).returncode == 0
@@ -380,6 +444,8 @@ BAD = {
     "--resume nowhere": "nowhere",
     "--resume nowhere --steps 7": "nowhere",
     "--horizon 1000000": "--horizon",
+    "--burn-in 24": "--burn-in",  # of 25 rows
+    "--density knn --batch-size 1 --burn-in 18": "--batch-size",
     "--density knn --batch-size 1 --length 7": "--batch-size",
     "--density knn --batch-size 1 --length 9": "--batch-size",  # four of its rows may be no ends
     "--density gauss": "knn",

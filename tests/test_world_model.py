@@ -21,7 +21,7 @@ def make_model(**changes) -> WorldModel:
     sizes = dict(deter=DETER, stoch=STOCH, hidden=8, units=8, depth=2)
     switches = dict(
         termination=True, fixed_prior=True, smooth_l1=True, decode_stoch_only=True,
-        decode_share=1.0, observe_first=True, free_nats=0.0,
+        decode_share=1.0, burn_in=0, heads_ahead=False, observe_first=True, free_nats=0.0,
     )  # fmt: skip
     return WorldModel(ACTIONS, **(sizes | switches | changes))
 
@@ -389,6 +389,32 @@ def test_termination_loss_is_the_bernoulli_nll_of_one_minus_continues():
     log_pmf = stats.bernoulli(p).logpmf(batch["terminated"].numpy())
     assert 0.1 < batch["terminated"].float().mean() < 0.9
     assert terms["termination"].item() == pytest.approx(-log_pmf[arrived].mean(), rel=1e-5)
+
+
+def test_rows_of_which_too_little_was_seen_teach_no_reward_and_no_end():
+    model, batch = make_model(burn_in=2), make_batch()
+    batch["is_first"][2, 0] = False  # it begins within an episode, as the others do not
+    before, _ = loss(model, batch)
+    for name, wrong in (("reward", batch["reward"] + 50), ("terminated", ~batch["terminated"])):
+        term = {"reward": "reward", "terminated": "termination"}[name]
+        for row, counts in (((2, 0), False), ((2, 1), False), ((2, 2), True), ((0, 1), True)):
+            changed = batch[name].clone()
+            changed[row] = wrong[row]
+            same = loss(model, batch | {name: changed})[0][term] == before[term]
+            assert same != counts
+
+
+@pytest.mark.parametrize("name", ["reward", "termination"])
+def test_heads_ahead_learn_what_dreams_meet_too(name):
+    """In (h, z ~ prior), as `imagine` makes it: the loss then moves the prior."""
+    terms = {}
+    for ahead in (False, True):
+        model, batch = make_model(heads_ahead=ahead), make_batch()
+        term = loss(model, batch)[0][name]
+        assert set(moves(term, model.prior_net.parameters())) == {ahead}
+        constant_head(getattr(model, name), 1.0)  # as wrong in one state as in another
+        terms[ahead] = loss(model, batch)[0][name].item()
+    assert terms[True] == pytest.approx(2 * terms[False])
 
 
 def test_continues_is_one_minus_the_probability_of_the_end():
