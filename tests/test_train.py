@@ -137,11 +137,11 @@ def test_coverage_is_of_the_rows_since_the_last_evaluation(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize("arm, collect, turn, turns, noise", [
-    ("maxent", "both", 1000, "EE AAAA EEEE AAAA", 0),
-    ("maxent", "explorer", 1000, "EE EEEE EEEE EEEE", 0),
+    ("maxent", "both", 1000, "EE AAAA EEEE AAAA", 0.3),
+    ("maxent", "explorer", 1000, "EE EEEE EEEE EEEE", 0.3),
     ("revised", "both", 1000, "EE AAAA EEEE AAAA", 0.3),
     ("revised", "explorer", 1000, "EE EEEE EEEE EEEE", 0.3),
-    ("maxent", "both", 4, "AA AAEE EEAA AAEE", 0),  # as in episodes longer than a turn
+    ("maxent", "both", 4, "AA AAEE EEAA AAEE", 0.3),  # as in episodes longer than a turn
 ])  # fmt: skip
 def test_only_the_explorers_actions_are_disturbed(
     arm, collect, turn, turns, noise, tmp_path, monkeypatch, numpy_env
