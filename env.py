@@ -350,6 +350,6 @@ class Replay:
         if len(self) < length:
             raise ValueError(f"The replay holds {len(self)} rows, fewer than a window of {length}.")
         first = self.added - len(self) + rng.integers(len(self) - length + 1, size=batch)
-        numbers = first[:, None] + np.arange(length)
-        rows = bytearray().join(map(self.read, numbers.flat))
-        return np.frombuffer(rows, self.dtype).reshape(numbers.shape)
+        wanted = first[:, None] + np.arange(length)
+        rows = bytearray().join(map(self.read, wanted.flat))
+        return np.frombuffer(rows, self.dtype).reshape(wanted.shape)

@@ -580,13 +580,7 @@ class Run:
         """Go on to the next episode: its first image."""
         self.episode += 1
         self.over, self.length, self.state, self.actions = False, 0, None, []
-        self.take_turn()
         return self.reset()
-
-    def take_turn(self) -> None:
-        """Of the explorer and, undisturbed, the evaluated actor, whoever has collected less
-        collects next, for an episode, of a longer one for TURN environment steps."""
-        self.explores = self.s.collect == "explorer" or self.lead <= 0
 
     def reset(self) -> np.ndarray:
         """The first image of the present episode, whose seed is its own."""
@@ -595,12 +589,13 @@ class Run:
         return self.env.reset(seed=int(seed))[0]
 
     def note_decision(self, action: np.ndarray, over: bool, info: dict) -> None:
-        """Count a decision that was taken."""
+        """Count a decision that was taken. After an episode, of a longer one after each TURN steps,
+        whoever has collected less, the explorer or the evaluated actor, collects next."""
         before, self.length = self.length, int(self.env.get_wrapper_attr("episode_lengths"))
         self.step, self.over = self.step + sum(gathered(self.length - before)), over
         self.lead += (self.length - before) * (1 if self.explores else -1)
-        if passed(before, self.length, TURN):
-            self.take_turn()
+        if over or passed(before, self.length, TURN):
+            self.explores = self.s.collect == "explorer" or self.lead <= 0
         self.actions.append(action.tolist())  # of numbers: 50,000 tensors take seconds to save
         self.visited.append(info["state"].tolist())
         if over:

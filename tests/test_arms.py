@@ -408,6 +408,12 @@ def test_beta_moves_the_stochastic_actor_and_not_the_deterministic_one():
         assert changed(snapshot(one), snapshot(other)) == {"stochastic_actor", "stochastic_player"}
 
 
+def test_heads_ahead_reach_the_model():
+    alone, both = (updated(tiny("maxent", heads_ahead=ahead))[1] for ahead in (False, True))
+    for name in ("model/reward", "model/termination"):
+        assert both[name] > 1.5 * alone[name]  # of two untrained guesses alike
+
+
 def test_terminal_states_start_no_dream():
     s = tiny("maxent")
     agent, batch, starts = make_agent(s), make_batch(s), []

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -680,6 +681,14 @@ def test_row_of_a_reset_leaves_nothing_of_the_row_it_overwrites():
     row = replay.last
     assert (row["image"] == 9).all() and row["is_first"] and not row["terminated"]
     assert row["reward"] == 0 and row["action"].tolist() == [0, 0]
+
+
+def test_a_row_that_the_disk_takes_a_part_of_is_not_added():
+    replay = filled(capacity=5, added=2)
+    replay.file = SimpleNamespace(name="a file", seek=lambda at: at, write=lambda row: len(row) - 1)
+    with pytest.raises(OSError, match="a file: no space"):
+        replay.add(np.zeros((64, 64, 3)))
+    assert replay.added == 2
 
 
 def test_a_replays_file_takes_five_percent_more_than_its_images_at_most():
