@@ -34,6 +34,7 @@ NOT_LEARNT = {
     "run_dir", "device", "precision",  # in files of before 2026-11-25
 }  # fmt: skip
 POLICIES = {"random": ":", "zero": "--", "constant": "-."}  # of reference.csv, and their lines
+GOALS = {"HopperBulletEnv-v0": 800, "HalfCheetahBulletEnv-v0": 300}  # the speed of learning
 COLUMNS = set("env_steps wall_seconds eval_return eval_interval95 eval_length coverage".split())
 
 
@@ -218,16 +219,19 @@ def table(runs, reference) -> str:
     and what it covered on average; a line a group of seeds."""
     columns = (
         "environment | arm | seed | steps | minutes | last return | best return | last fifth | "
-        "last length | mean coverage, nats"
+        "last length | mean coverage, nats | minutes to a return"
     )
-    lines = [columns, " | ".join(10 * ["---"])]
+    lines = [columns, " | ".join(11 * ["---"])]
     for env, arms in sorted(runs.items()):
         for policy in POLICIES:
             if row := reference.get((env, policy)):
-                earned = f"{row['return']} ± {row['interval95']} | – | – | {row['length']} | –"
+                earned = f"{row['return']} ± {row['interval95']} | – | – | {row['length']} | – | –"
                 lines.append(f"{env} | {policy} actions | – | – | – | {earned}")
         for name, of in arms.items():
-            rows = [row_of(seed, run, len(of) == 1) for seed, run in sorted(of.items())]
+            rows = [
+                f"{row_of(seed, run, len(of) == 1)} | {soon(run, GOALS.get(env))}"
+                for seed, run in sorted(of.items())
+            ]
             lines += [f"{env} | {name} | {row}" for row in rows + rows_of_all(of)]
     return "".join(f"| {line} |\n" for line in lines)
 
@@ -245,6 +249,14 @@ def row_of(seed: str, run: dict, alone: bool) -> str:
     )
 
 
+def soon(run: dict, goal: float | None) -> str:
+    """The goal, and the minutes after which an evaluation first reached it, if one did."""
+    if goal is None:
+        return "–"
+    reached = np.flatnonzero(run["eval_return"] >= goal)
+    return f"{goal}: " + (f"{run['wall_seconds'][reached[0]] / 60:.0f}" if reached.size else "–")
+
+
 def rows_of_all(runs: dict[str, dict]) -> list[str]:
     """The row of a group of seeds, up to where all of them are; none of a single one."""
     if len(runs) == 1:
@@ -253,7 +265,7 @@ def rows_of_all(runs: dict[str, dict]) -> list[str]:
     earned, seen = (
         shown(over_seeds([of(run, end) for run in runs.values()])) for of in (score, covered)
     )
-    return [f"**IQM of {len(runs)}** | {end:,.0f} | – | – | – | {earned} | – | {seen}"]
+    return [f"**IQM of {len(runs)}** | {end:,.0f} | – | – | – | {earned} | – | {seen} | –"]
 
 
 def main(arguments: list[str]) -> int:

@@ -5,8 +5,9 @@
 prints pytest-benchmark's table and, above it, the rows of the README's table, one a benchmark:
 seconds of an update (median and least) and of its parts, floating-point operations, the machine's
 own matrix rates in bfloat16 and float32, the fraction of the first that is reached, and the peak
-memory; then decisions and environment steps a second of collection. With `| grep '^|'` the rows
-alone. Where a CUDA device is, it is measured too. Not part of the default tests.
+memory; what an update of `maxent` costs in one and two processes of one and two threads; then
+decisions and environment steps a second of collection. With `| grep '^|'` the rows alone. Where a
+CUDA device is, it is measured too. Not part of the default tests.
 """
 
 import ctypes
@@ -18,6 +19,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import torch.distributed as dist
+import torch.multiprocessing as mp
 from torch.utils.flop_counter import FlopCounterMode
 
 from actors import explore
@@ -143,6 +146,37 @@ def test_update(device, arm, preset, benchmark, capsys, monkeypatch):
             f"\n| {arm}{', CUDA' * (device != 'cpu')} | {preset} | {seconds:.3f} | {least:.3f} "
             f"| {parts} | {gflop:.0f} | {fast:.0f}, {slow:.0f} | {gflop / seconds / fast:.2f} "
             f"| {memory:.1f} |"
+        )
+
+
+def process(rank: int, processes: int, threads: int, preset: str, folder: Path) -> None:
+    """One of so many processes that share `maxent`'s batch, as under torchrun; the first one writes
+    down the seconds of each update but the first two."""
+    torch.set_num_threads(threads)
+    meeting = f"file://{folder / 'meeting'}"
+    dist.init_process_group("gloo", init_method=meeting, rank=rank, world_size=processes)
+    s = default_settings("maxent", preset)
+    agent = Agent(s, 3, CPU, bfloat16=has_bfloat16(CPU))
+    batch, seconds = random_batch(s.batch_size // processes, s.length, 3), []
+    for _ in range(22 if preset == "small" else 5):
+        began = clock()
+        update(agent, batch, 0.1, s)
+        seconds.append(clock() - began)
+    if rank == 0:
+        np.savetxt(folder / "seconds", seconds[2:])
+    dist.destroy_process_group()
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("processes, threads", [(1, 1), (1, 2), (2, 1)])
+def test_processes(processes, threads, preset, benchmark, capsys, tmp_path):
+    arguments = processes, threads, preset, tmp_path
+    benchmark.pedantic(lambda: mp.spawn(process, arguments, nprocs=processes), rounds=1)
+    seconds = np.loadtxt(tmp_path / "seconds")
+    with capsys.disabled():
+        print(
+            f"\n| maxent, {processes} × {threads} threads | {preset} "
+            f"| {np.median(seconds):.3f} | {min(seconds):.3f} |"
         )
 
 
