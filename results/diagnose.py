@@ -34,7 +34,6 @@ REWARDS = "rewards, R² (1: exact, 0: no better than their mean)"
 ALIVE = "share of the rewards' variance that is the part for being alive"
 BLIND = "correlation of that part with the error of predicted rewards (0: it is known)"
 DECISIONS = "decisions"
-NOISE = "standard deviation of z where the image is seen (1: noise alone)"
 SIGMA = "σ of the explorer before its tanh (5 at first)"
 ENDS = "ends of episodes that happened"
 EXPECTED = "ends of episodes that the model expected"
@@ -100,7 +99,6 @@ def measure(agent: Agent, name: str, episode: Episode) -> dict[str, np.ndarray]:
         the real one is known, which in an episode cut off by a time limit is long before its end.
         outlived: (at most H − 3,) chance that a dream outlives the end by 3, begun so far before.
         seen_image: (L,) squared error of a pixel of an image that is seen: its reconstruction.
-        noise: (L,) σ of the posterior, mean over z, if its prior is N(0, 1).
         saturated: (L, A) whether an action is within 0.01 of its bound.
         greedy, sigma: (L, A) the actor's mode in each state, and the explorer's σ.
     """
@@ -110,8 +108,7 @@ def measure(agent: Agent, name: str, episode: Episode) -> dict[str, np.ndarray]:
     )
     arrived_by = torch.cat([torch.zeros_like(actions[:1]), actions])
     is_first = torch.arange(len(images), device=agent.device) == 0
-    observed = model.observe(images[None], arrived_by[None], is_first[None])
-    states = observed.state[0]  # (L + 1, D)
+    states = model.observe(images[None], arrived_by[None], is_first[None]).state[0]  # (L + 1, D)
     dream = model.imagine(states[:-1], actor, s.horizon)
     believed = imagined_returns(dream, agent.critics[name], s.gamma, s.lam)[0]
     # a reward 300 decisions ahead counts 0.05 at γ = 0.99: what a time limit cut off is then little
@@ -128,8 +125,6 @@ def measure(agent: Agent, name: str, episode: Episode) -> dict[str, np.ndarray]:
         left = torch.arange(min(len(rewards), s.horizon - LATE), 0, -1)
         survival = dream.continues[:, -len(left) :].cumprod(0).cpu()
         found["outlived"] = survival[left - 1 + LATE, torch.arange(len(left))].numpy()
-    if model.fixed_prior:
-        found["noise"] = observed.posterior.stddev[0, 1:].mean(-1).cpu().numpy()
     found["saturated"] = np.abs(episode.actions) > 0.99
     found["greedy"] = actor.mode(states[:-1]).cpu().numpy()
     if hasattr(actor, "distribution"):
@@ -181,8 +176,6 @@ def figures(found: dict[str, np.ndarray], episodes: list[Episode]) -> dict[str, 
         # covariances with the whole of the parts of a sum are shares of its variance
         named[ALIVE] = np.cov(found["alive"], reward[1])[0, 1] / np.var(reward[1], ddof=1)
         named[BLIND] = np.corrcoef(found["alive"], reward[1] - reward[0])[0, 1]
-    if "noise" in found:
-        named[NOISE] = found["noise"].mean()
     if "sigma" in found:
         named[SIGMA] = found["sigma"].mean()
     if "outlived" in found:
@@ -268,9 +261,6 @@ VERDICTS = (
     # Of a range of 2. First, since rewards hardly vary where actions do not.
     (lambda of: of[DEVIATION] < 0.05,
      "the actor does the same whatever it sees: see reward_r2 early on; raise --action-penalty."),
-    # With the paper's weights it was 0.8 on our images, with a tenth of them 0.3 (trials, L).
-    (lambda of: of.get(NOISE, 0) > 0.6,
-     "z is mostly noise: the image hardly reaches the state; lower --kl-standard-weight."),
     # Whatever follows is learnt from these; a model that learns has 0.5 by 10,000 steps.
     (lambda of: of[REWARDS] < 0.3,
      "the model does not know the rewards that it is shown: more prefill, or weigh rewards more."),

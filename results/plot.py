@@ -215,8 +215,8 @@ def shown(found: tuple[float, float, float]) -> str:
 
 
 def table(runs, reference) -> str:
-    """A line a run: its last and its best evaluation, what it earned in the last fifth of its steps
-    and what it covered on average; a line a group of seeds."""
+    """A line a run: its last and its best evaluation, what it earned in the last fifth of its
+    steps, what it covered on average, and how soon it was good; a line a group of seeds."""
     columns = (
         "environment | arm | seed | steps | minutes | last return | best return | last fifth | "
         "last length | mean coverage, nats | minutes to a return"
@@ -229,7 +229,7 @@ def table(runs, reference) -> str:
                 lines.append(f"{env} | {policy} actions | – | – | – | {earned}")
         for name, of in arms.items():
             rows = [
-                f"{row_of(seed, run, len(of) == 1)} | {soon(run, GOALS.get(env))}"
+                f"{row_of(seed, run, len(of) == 1)} | {minutes_to(run, GOALS.get(env))}"
                 for seed, run in sorted(of.items())
             ]
             lines += [f"{env} | {name} | {row}" for row in rows + rows_of_all(of)]
@@ -249,7 +249,7 @@ def row_of(seed: str, run: dict, alone: bool) -> str:
     )
 
 
-def soon(run: dict, goal: float | None) -> str:
+def minutes_to(run: dict, goal: float | None) -> str:
     """The goal, and the minutes after which an evaluation first reached it, if one did."""
     if goal is None:
         return "–"
