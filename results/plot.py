@@ -228,15 +228,13 @@ def table(runs, reference) -> str:
                 earned = f"{row['return']} ± {row['interval95']} | – | – | {row['length']} | – | –"
                 lines.append(f"{env} | {policy} actions | – | – | – | {earned}")
         for name, of in arms.items():
-            rows = [
-                f"{row_of(seed, run, len(of) == 1)} | {minutes_to(run, GOALS.get(env))}"
-                for seed, run in sorted(of.items())
-            ]
+            alone, goal = len(of) == 1, GOALS.get(env)
+            rows = [row_of(seed, run, alone, goal) for seed, run in sorted(of.items())]
             lines += [f"{env} | {name} | {row}" for row in rows + rows_of_all(of)]
     return "".join(f"| {line} |\n" for line in lines)
 
 
-def row_of(seed: str, run: dict, alone: bool) -> str:
+def row_of(seed: str, run: dict, alone: bool, goal: float | None) -> str:
     """A run's row from its seed on; with the interval over an evaluation's episodes if no other
     seed tells how far runs differ."""
     last = {column: values[-1] for column, values in run.items()}
@@ -245,7 +243,8 @@ def row_of(seed: str, run: dict, alone: bool) -> str:
     return (
         f"{seed} | {end:,.0f} | {last['wall_seconds'] / 60:.0f} | "
         f"{last['eval_return']:.1f}{spread} | {run['eval_return'].max():.1f} | "
-        f"{score(run, end):.1f} | {last['eval_length']:.0f} | {covered(run, end):.1f}"
+        f"{score(run, end):.1f} | {last['eval_length']:.0f} | {covered(run, end):.1f} | "
+        f"{minutes_to(run, goal)}"
     )
 
 
