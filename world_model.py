@@ -196,8 +196,8 @@ class WorldModel(nn.Module):
         decode_share: of a batch's images, those that are decoded, drawn at random (ours).
         burn_in: first rows of a sequence that begins within an episode, whose h does not hold what
             came before: they teach no reward and no end (ours; the idea is R2D2's).
-        heads_ahead: rewards and ends are learnt in (h, z ~ prior) too, where dreams ask for them
-            (ours).
+        heads_ahead: steps of dreams along recorded actions in which rewards and ends are learnt
+            too, since actors ask for them there (ours; 0: in what was seen alone).
         observe_first: z_0 is inferred from o_0, so a_0 depends on it (§4.2). Without it s_0 is
             zero and o_0 is never seen.
         free_nats: KL below which there is nothing to gain (Dreamer); with `fixed_prior` unused.
@@ -206,7 +206,7 @@ class WorldModel(nn.Module):
     def __init__(
         self, actions: int, *, deter: int, stoch: int, hidden: int, units: int, depth: int,
         termination: bool, fixed_prior: bool, smooth_l1: bool, decode_stoch_only: bool,
-        decode_share: float, burn_in: int, heads_ahead: bool, observe_first: bool, free_nats: float,
+        decode_share: float, burn_in: int, heads_ahead: int, observe_first: bool, free_nats: float,
     ):  # fmt: skip
         super().__init__()
         self.deter, self.stoch, self.size = deter, stoch, deter + stoch
@@ -319,7 +319,7 @@ class WorldModel(nn.Module):
             image        ½ Σ (o − o')² over pixels; of `decode_share` of the images
             reward       Smooth L1, or ½ (r − r')²; of settled rows; first ones have none
             termination  binary cross-entropy on `terminated`, never on `truncated`; likewise
-                         both: in (h, z ~ posterior), and with `heads_ahead` in (h, z ~ prior) too
+                         both: in (h, z ~ posterior), and with `heads_ahead` in dreams too
             kl_standard  KL(posterior ‖ N(0, 1)), which gives the prior no gradient (§4.2)
             jeffreys     KL(posterior ‖ prior) + KL(prior ‖ posterior) (§4.2)
             kl           max(KL(posterior ‖ prior), free nats), Dreamer's, in place of the last two
@@ -343,17 +343,15 @@ class WorldModel(nn.Module):
         terms = {"image": masked_mean(image, seen.flatten()[some])}
         terms |= self.head_losses(observed.state, batch, taught)
         if self.heads_ahead:
-            deter = observed.state[..., : self.deter]
-            dreamt = torch.cat([deter, observed.prior.rsample()], -1)
-            for name, term in self.head_losses(dreamt, batch, taught).items():
+            for name, term in self.losses_ahead(observed.state, batch).items():
                 terms[name] = terms[name] + term
         return terms | self.divergences(observed.posterior, observed.prior, seen), observed.state
 
     def head_losses(
         self, state: Tensor, batch: dict[str, Tensor], taught: Tensor
     ) -> dict[str, Tensor]:
-        """The terms reward and termination of `loss` in states (B, T, D), of rows where `taught`
-        (B, T) is 1."""
+        """The terms reward and termination of `loss` in states (…, D), of rows where `taught` (…)
+        is 1."""
         pair = self.predict_reward(state), batch["reward"]
         if self.smooth_l1:
             loss = F.smooth_l1_loss(*pair, reduction="none")
@@ -365,6 +363,26 @@ class WorldModel(nn.Module):
             loss = F.binary_cross_entropy_with_logits(logit, terminated.float(), reduction="none")
             terms["termination"] = masked_mean(loss, taught)
         return terms
+
+    def losses_ahead(self, state: Tensor, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """The terms reward and termination of `loss` in dreams along the recorded actions, each of
+        `heads_ahead` steps from a settled one of the states (B, T, D). Where one ends the next
+        begins, the last with the sequence's end; of another episode none learns anything."""
+        steps = min(self.heads_ahead, state.shape[1] - 1)
+        starts = torch.arange((state.shape[1] - 1) % steps, state.shape[1] - 1, steps)
+        ahead = starts + torch.arange(1, steps + 1)[:, None]
+
+        def along(rows: Tensor) -> Tensor:
+            """(B, T, …) -> (steps, N, …): what came, in all N dreams."""
+            return rows[:, ahead].transpose(0, 1).flatten(1, 2)
+
+        actions = along(batch["action"])
+        to_take = iter([*actions, actions[-1]])  # the last one is not taken
+        dream = self.imagine(state[:, starts].flatten(0, 1), lambda _: next(to_take), steps)
+        came = {name: along(batch[name]) for name in ("reward", "terminated", "is_first")}
+        taught = self.settled(batch["is_first"])[:, starts].flatten()
+        taught = taught * (~came["is_first"]).cumprod(0)
+        return self.head_losses(dream.state[1:], came, taught)
 
     def divergences(self, posterior: Normal, prior: Normal, seen: Tensor) -> dict[str, Tensor]:
         """The terms of `loss` that hold the posterior to the prior, in nats, summed over z."""

@@ -21,7 +21,7 @@ def make_model(**changes) -> WorldModel:
     sizes = dict(deter=DETER, stoch=STOCH, hidden=8, units=8, depth=2)
     switches = dict(
         termination=True, fixed_prior=True, smooth_l1=True, decode_stoch_only=True,
-        decode_share=1.0, burn_in=0, heads_ahead=False, observe_first=True, free_nats=0.0,
+        decode_share=1.0, burn_in=0, heads_ahead=0, observe_first=True, free_nats=0.0,
     )  # fmt: skip
     return WorldModel(ACTIONS, **(sizes | switches | changes))
 
@@ -406,15 +406,47 @@ def test_rows_of_which_too_little_was_seen_teach_no_reward_and_no_end():
 
 @pytest.mark.parametrize("name", ["reward", "termination"])
 def test_heads_ahead_learn_what_dreams_meet_too(name):
-    """In (h, z ~ prior), as `imagine` makes it: the loss then moves the prior."""
+    """Of six rows dreams of two steps meet the last four, but of no other episode: the second
+    sequence's begins at its row 3. The loss then moves the prior."""
     terms = {}
-    for ahead in (False, True):
+    for ahead in (0, 2):
         model, batch = make_model(heads_ahead=ahead), make_batch()
-        term = loss(model, batch)[0][name]
-        assert set(moves(term, model.prior_net.parameters())) == {ahead}
-        constant_head(getattr(model, name), 1.0)  # as wrong in one state as in another
-        terms[ahead] = loss(model, batch)[0][name].item()
-    assert terms[True] == pytest.approx(2 * terms[False])
+        assert set(moves(loss(model, batch)[0][name], model.prior_net.parameters())) == {ahead > 0}
+        constant_head(getattr(model, name), 1.0)
+        terms[ahead] = loss(model, batch)[0][name]
+    taught = torch.zeros(3, 6)
+    taught[:, 2:] = 1
+    taught[1, 3] = 0
+    met = model.head_losses(torch.zeros(3, 6, model.size), batch, taught)[name]
+    assert terms[2].item() == pytest.approx((terms[0] + met).item())
+
+
+@pytest.mark.parametrize("ahead, starts", [(1, (0, 1, 2, 3, 4)), (2, (1, 3)), (9, (0,))])
+def test_heads_ahead_dream_along_the_actions_that_were_taken(ahead, starts, monkeypatch):
+    model, batch = make_model(heads_ahead=ahead), make_batch()
+    dreamt, head_losses = [], model.head_losses
+    monkeypatch.setattr(model, "head_losses", lambda *a: dreamt.append(a[0]) or head_losses(*a))
+    _, states = loss(model, batch)
+    dream = dreamt[1].unflatten(1, (3, len(starts)))  # (steps, B, starts, D)
+    assert len(dream) == min(ahead, 5)
+    for n, start in enumerate(starts):
+        state = states[:, start]
+        for k, arrived in enumerate(dream[:, :, n]):
+            share = model.dense_action(batch["action"][:, start + 1 + k])
+            h = model.recur(*state.split([DETER, STOCH], -1), share)
+            torch.testing.assert_close(arrived[:, :DETER], h)
+            state = arrived
+
+
+def test_dreams_along_recorded_actions_end_with_their_episode_and_begin_where_enough_was_seen(
+    monkeypatch,
+):
+    model, batch = make_model(burn_in=2, heads_ahead=5), make_batch()
+    batch["is_first"][2, 0] = False  # it begins within an episode, as the others do not
+    taught, head_losses = [], model.head_losses
+    monkeypatch.setattr(model, "head_losses", lambda *a: taught.append(a[2]) or head_losses(*a))
+    loss(model, batch)
+    assert taught[1].T.tolist() == [[1, 1, 1, 1, 1], [1, 1, 0, 0, 0], [0, 0, 0, 0, 0]]
 
 
 def test_continues_is_one_minus_the_probability_of_the_end():
