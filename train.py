@@ -106,7 +106,7 @@ class Settings:
     batch_size: Size = 50  # sequences a batch (Dreamer: 50)
     length: Annotated[Size, Interval(ge=2)] = 50  # rows a sequence (Dreamer: 50)
     burn_in: Whole = 0  # rows of one begun mid-episode: no reward, end or dream is of them (ours)
-    heads_ahead: Whole = 0  # steps of dreams where rewards and ends are learnt too (ours)
+    heads_ahead: Whole = 0  # steps of dreams along recorded actions that teach the heads too (ours)
     decode_share: Share = 1.0  # of a batch's images, those that are decoded (Dreamer: all)
     horizon: Size = 15  # imagined steps, and n of Eq. (10) (Dreamer)
     starts: Share = 1.0  # of a batch's live states, those that actors dream on from (Dreamer: all)

@@ -365,16 +365,20 @@ class WorldModel(nn.Module):
         return terms
 
     def losses_ahead(self, state: Tensor, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """The terms reward and termination of `loss` in dreams along the recorded actions, each of
-        `heads_ahead` steps from a settled one of the states (B, T, D). Where one ends the next
-        begins, the last with the sequence's end; of another episode none learns anything."""
-        steps = min(self.heads_ahead, state.shape[1] - 1)
-        starts = torch.arange((state.shape[1] - 1) % steps, state.shape[1] - 1, steps)
-        ahead = starts + torch.arange(1, steps + 1)[:, None]
+        """The terms reward and termination of `loss` in dreams along the recorded actions.
+
+        They take `heads_ahead` steps each, fewer in a shorter sequence, one after the other, up to
+        the last row. One from an unsettled state teaches nothing, nor does any beyond its episode.
+        Gradients pass into the states (B, T, D) that they start from.
+        """
+        length = state.shape[1]
+        steps = min(self.heads_ahead, length - 1)
+        first = (length - 1) % steps
+        starts = slice(first, -1, steps)
 
         def along(rows: Tensor) -> Tensor:
             """(B, T, …) -> (steps, N, …): what came, in all N dreams."""
-            return rows[:, ahead].transpose(0, 1).flatten(1, 2)
+            return rows[:, first + 1 :].unflatten(1, (-1, steps)).flatten(0, 1).transpose(0, 1)
 
         actions = along(batch["action"])
         to_take = iter([*actions, actions[-1]])  # the last one is not taken

@@ -409,7 +409,8 @@ def test_beta_moves_the_stochastic_actor_and_not_the_deterministic_one():
 
 
 def test_heads_ahead_reach_the_model():
-    alone, both = (updated(tiny("maxent", heads_ahead=ahead))[1] for ahead in (0, 2))
+    (_, alone), (agent, both) = (updated(tiny("maxent", heads_ahead=n)) for n in (0, 2))
+    assert agent.model.heads_ahead == 2
     for name in ("model/reward", "model/termination"):
         assert both[name] > 1.5 * alone[name]  # of two untrained guesses alike
 

@@ -421,32 +421,54 @@ def test_heads_ahead_learn_what_dreams_meet_too(name):
     assert terms[2].item() == pytest.approx((terms[0] + met).item())
 
 
+@pytest.fixture
+def taught(monkeypatch):
+    """What a model's `head_losses` was given: states, rows, and which of them count."""
+    given, head_losses = [], WorldModel.head_losses
+    noting = lambda model, *a: given.append(a) or head_losses(model, *a)  # noqa: E731
+    monkeypatch.setattr(WorldModel, "head_losses", noting)
+    return given
+
+
 @pytest.mark.parametrize("ahead, starts", [(1, (0, 1, 2, 3, 4)), (2, (1, 3)), (9, (0,))])
-def test_heads_ahead_dream_along_the_actions_that_were_taken(ahead, starts, monkeypatch):
+def test_heads_ahead_dream_along_the_actions_that_were_taken(ahead, starts, taught):
     model, batch = make_model(heads_ahead=ahead), make_batch()
-    dreamt, head_losses = [], model.head_losses
-    monkeypatch.setattr(model, "head_losses", lambda *a: dreamt.append(a[0]) or head_losses(*a))
     _, states = loss(model, batch)
-    dream = dreamt[1].unflatten(1, (3, len(starts)))  # (steps, B, starts, D)
+    of_start = (3, len(starts))
+    dream, came = taught[1][0].unflatten(1, of_start), taught[1][1]
     assert len(dream) == min(ahead, 5)
     for n, start in enumerate(starts):
         state = states[:, start]
         for k, arrived in enumerate(dream[:, :, n]):
-            share = model.dense_action(batch["action"][:, start + 1 + k])
-            h = model.recur(*state.split([DETER, STOCH], -1), share)
+            row = start + 1 + k
+            h = model.recur(
+                *state.split([DETER, STOCH], -1), model.dense_action(batch["action"][:, row])
+            )
             torch.testing.assert_close(arrived[:, :DETER], h)
+            for name in came:
+                assert torch.equal(came[name].unflatten(1, of_start)[k, :, n], batch[name][:, row])
             state = arrived
 
 
+@pytest.mark.parametrize("ahead, rows", [
+    (5, [[[1, 1, 1, 1, 1]], [[1, 1, 0, 0, 0]], [[0, 0, 0, 0, 0]]]),  # from row 0
+    (2, [[[1, 1], [1, 1]], [[1, 0], [1, 1]], [[0, 0], [1, 1]]]),  # from rows 1 and 3
+])  # fmt: skip
 def test_dreams_along_recorded_actions_end_with_their_episode_and_begin_where_enough_was_seen(
-    monkeypatch,
+    ahead, rows, taught
 ):
-    model, batch = make_model(burn_in=2, heads_ahead=5), make_batch()
+    model, batch = make_model(burn_in=2, heads_ahead=ahead), make_batch()
     batch["is_first"][2, 0] = False  # it begins within an episode, as the others do not
-    taught, head_losses = [], model.head_losses
-    monkeypatch.setattr(model, "head_losses", lambda *a: taught.append(a[2]) or head_losses(*a))
     loss(model, batch)
-    assert taught[1].T.tolist() == [[1, 1, 1, 1, 1], [1, 1, 0, 0, 0], [0, 0, 0, 0, 0]]
+    assert taught[1][2].T.unflatten(0, (3, -1)).tolist() == rows
+
+
+def test_dreams_along_recorded_actions_teach_the_states_that_they_start_from():
+    model, batch = make_model(heads_ahead=2), make_batch()
+    _, states = loss(model, batch)
+    ahead = model.losses_ahead(states, batch)
+    for term in ahead.values():
+        assert all(moves(term, model.encoder.parameters()))
 
 
 def test_continues_is_one_minus_the_probability_of_the_end():
