@@ -381,8 +381,8 @@ class WorldModel(nn.Module):
             return rows[:, first + 1 :].unflatten(1, (-1, steps)).flatten(0, 1).transpose(0, 1)
 
         actions = along(batch["action"])
-        to_take = iter([*actions, actions[-1]])  # the last one is not taken
-        dream = self.imagine(state[:, starts].flatten(0, 1), lambda _: next(to_take), steps)
+        taken = iter([*actions, actions[-1]])  # the last one is chosen, not taken
+        dream = self.imagine(state[:, starts].flatten(0, 1), lambda _: next(taken), steps)
         came = {name: along(batch[name]) for name in ("reward", "terminated", "is_first")}
         taught = self.settled(batch["is_first"])[:, starts].flatten()
         taught = taught * (~came["is_first"]).cumprod(0)
