@@ -14,6 +14,7 @@ seeds of every evaluation. A run that was stopped does not go on.
 import argparse
 import csv
 import json
+import re
 import sys
 import time
 from pathlib import Path
@@ -25,7 +26,7 @@ from gymnasium import wrappers
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import train
-from env import Foreign, coverage, make_env
+from env import EnvironmentFault, Foreign, coverage, find_spec, make_env
 from results.made_with import made_with
 
 COLUMNS = "env_steps wall_seconds eval_return eval_interval95 eval_length coverage".split()
@@ -41,7 +42,8 @@ def make_world(arm: str, env_id: str) -> gym.Env:
     if arm == "sac-pixels":
         s = train.default_settings()
         return make_env(env_id, s.action_repeat, s.camera_distance, s.floor_brightness)
-    world = wrappers.RecordEpisodeStatistics(Foreign(gym.make(env_id, render_mode="rgb_array")))
+    world = Foreign(gym.make(find_spec(env_id), render_mode="rgb_array"))
+    world = wrappers.RecordEpisodeStatistics(world)
     return wrappers.RepeatAction(world, USUAL[arm]["action_repeat"])
 
 
@@ -94,7 +96,7 @@ class Record:
 
 
 def learn(settings: dict, folder: Path, sb3) -> None:
-    """A run of SB3's SAC from beginning to end."""
+    """A run of SB3's SAC from beginning to end, in a folder that it makes."""
     arm, vector = settings["arm"], sb3.common.vec_env
     worlds = [vector.DummyVecEnv([lambda: make_world(arm, settings["env"])]) for _ in range(2)]
     own = {"policy": "MlpPolicy"}
@@ -102,6 +104,7 @@ def learn(settings: dict, folder: Path, sb3) -> None:
         worlds = [vector.VecFrameStack(world, STACK) for world in worlds]
         own = {"policy": "CnnPolicy", "buffer_size": ROWS}
     model = sb3.SAC(env=worlds[0], seed=settings["seed"], **own)
+    folder.mkdir(parents=True)
     (folder / "settings.json").write_text(json.dumps(settings, indent=2) + "\n")
     by = made_with() | {"threads": torch.get_num_threads(), "stable_baselines3": sb3.__version__}
     (folder / "made_with.json").write_text(json.dumps([by], indent=2) + "\n")
@@ -122,16 +125,18 @@ def main(arguments: list[str]) -> int:
     arm = f"sac-{command.sees}"
     given = {k: v for k, v in vars(command).items() if k in ("steps", "minutes") and v is not None}
     settings = {"env": command.env, "arm": arm, "seed": command.seed} | USUAL[arm] | given
-    folder = command.run_dir or Path("runs") / f"{arm}-{command.env}-seed{command.seed}"
+    name = re.sub(r"[^\w.-]", "-", f"{arm}-{command.env}-seed{command.seed}")
+    folder = command.run_dir or Path("runs") / name
     try:
         import stable_baselines3 as sb3
     except ImportError:
         print("Stable-Baselines3 is not here: pip install stable-baselines3.", file=sys.stderr)
         return 2
     try:
-        folder.mkdir(parents=True)
+        if folder.exists():
+            raise ValueError(f"{folder} is there already: name another --run-dir.")
         learn(settings, folder, sb3)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, EnvironmentFault) as error:
         print(error, file=sys.stderr)
         return 2
     return 0

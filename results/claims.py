@@ -2,17 +2,18 @@
 
     python results/claims.py [FOLDER]
 
-prints, claim by claim, comparison by comparison, what was found: the difference of interquartile
-means over seeds and its 95% bootstrap interval (Agarwal et al. 2021), of what runs earn in the
-last fifth of the steps that all of them made. Supported: the whole interval is where the claim
-says. Refuted: none of it is. Else, or with fewer than three seeds, or none: not enough evidence.
-Beside them, what the paper's argument needs: that the explorer covers more of the environment's own
-states.
+prints, for the runs of results/whole if no folder is given, claim by claim, comparison by
+comparison, what was found: the difference of interquartile means over seeds and its 95% bootstrap
+interval (Agarwal et al. 2021), of what runs earn in the last fifth of the steps that all of them
+made. Supported: the whole interval is where the claim says. Refuted: none of it is. Else, or with
+fewer than three seeds, or none: not enough evidence. Beside them, what the paper's argument needs:
+that the explorer covers more of the environment's own states.
 """
 
 import argparse
 import sys
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -34,7 +35,7 @@ class Comparison(NamedTuple):
     robot: str
     signs: dict[str, int]  # of arms, named as plot.py names them
     lies: str  # "above" 0, "within" a margin of it, or "not above" that margin
-    what: callable = score  # or `covered`
+    what: Callable[[dict, float], float] = score  # or `covered`
 
 
 def above(robot: str, arm: str, other: str, what=score) -> Comparison:
@@ -143,9 +144,9 @@ def shared_changes(runs: dict) -> list[frozenset[str]]:
 
 
 def report(runs: dict, reference: dict) -> str:
-    """All claims, once for each configuration that there is."""
-    lines = []
-    for common in shared_changes(runs) or [frozenset()]:
+    """All claims, once for each configuration that two arms share; and which runs have no other."""
+    lines, configurations = [], shared_changes(runs) or [frozenset()]
+    for common in configurations:
         lines += [f"With {', '.join(sorted(common)) or 'the usual settings'}:", ""]
         lines += ["| claim, robot | compared | by how much | seeds | steps | verdict |"]
         lines += [f"|{6 * ' --- |'}"]
@@ -153,6 +154,10 @@ def report(runs: dict, reference: dict) -> str:
             said, rows = judge(groups, runs, common, reference)
             lines += [f"| **{claim}** | | | | | **{said}** |", *(f"| {row} |" for row in rows)]
         lines += [""]
+    names = {n for of in CLAIMS.values() for _, group in of for one in group for n in one.signs}
+    held = {(arm, own | c) for arm, own in map(changes, names) for c in configurations}
+    alone = sorted({label for of in runs.values() for label in of if changes(label) not in held})
+    lines += [f"Left out, of settings that no other arm has: {label}." for label in alone]
     return "\n".join(lines)
 
 
@@ -160,9 +165,8 @@ def main(arguments: list[str]) -> int:
     """Runs a command line. Returns the exit code: 0 done, 2 bad input."""
     says = "Holds the paper's claims against all runs below a folder."
     parser = argparse.ArgumentParser(prog="python results/claims.py", description=says)
-    parser.add_argument(
-        "folder", type=Path, nargs="?", default=plot.HERE, help="runs (%(default)s)"
-    )
+    add, says = parser.add_argument, "where runs are, however deep (%(default)s)"
+    add("folder", type=Path, nargs="?", default=plot.WHOLE, help=says)
     folder = parser.parse_args(arguments).folder
     try:
         runs = plot.read_runs(folder)

@@ -2,9 +2,9 @@
 
     python results/diagnose.py runs/NAME
 
-plays fresh episodes with each actor, and holds what the model says of them against what happened.
-Prints the figures and a verdict, and draws diagnosis-STEP.png in the run's folder. The run may
-still be going on: nothing of it is changed.
+plays the evaluation's episodes with each actor, and holds what the model says of them against what
+happened. Prints the figures and a verdict, and draws diagnosis-STEP.png in the run's folder. The
+run may still be going on: nothing of it is changed.
 """
 
 import argparse
@@ -256,7 +256,7 @@ def draw(path: Path, agent: Agent, played, found, metrics) -> None:
     figure.savefig(path, dpi=100)
 
 
-# What to look at first, in this order: the first whose condition holds of any actor.
+# What to look at first, in this order: the first whose condition holds of an actor.
 VERDICTS = (
     # Of a range of 2. First, since rewards hardly vary where actions do not.
     (lambda of: of[DEVIATION] < 0.05,
@@ -267,7 +267,7 @@ VERDICTS = (
     # A single end may be of a rare kind.
     (lambda of: of[ENDS] >= 3 and of[EXPECTED] < 0.5 * of[ENDS],
      "the model does not see ends coming: weigh terminations more."),
-    # Hopper and Walker2D had 0.59 to 0.83 with ends of weight 10. Not yet measured with 1.
+    # Hopper and Walker2D had 0.59 to 0.83 when they did not stand.
     (lambda of: of[ENDS] >= 3 and of.get(OUTLIVED, 0) > 0.6,
      "dreams outlive ends that came: nothing is feared; try a higher --termination-weight."),
     # At 0.005 a decision, dreams lose half as much again of what is far off as by γ = 0.99.
@@ -283,9 +283,10 @@ VERDICTS = (
 
 
 def verdict(named: dict[str, dict[str, float]]) -> str:
-    """One sentence: what to look at first, given each actor's figures."""
-    for holds, sentence in VERDICTS:
-        for name, of in named.items():
+    """One sentence: what to look at first, given each actor's figures. Of what is evaluated, the
+    last of them, before the explorer."""
+    for name, of in reversed(named.items()):
+        for holds, sentence in VERDICTS:
             if holds(of):
                 return f"Look first at the {name} actor: {sentence}"
     return "Nothing stands out: the model is true to what these actors meet."
@@ -321,7 +322,7 @@ def diagnose(command: argparse.Namespace) -> Path:
 
 def main(arguments: list[str]) -> int:
     """Runs a command line. Returns its `exit_code`."""
-    says = "Holds what a run's model predicts against what happens in fresh episodes."
+    says = "Holds what a run's model predicts against what happens in the evaluation's episodes."
     parser = command_line("diagnose.py", says, episodes=5)
     mpl.use("Agg")
     return exit_code(lambda: print(diagnose(parser.parse_args(arguments))))

@@ -2,9 +2,10 @@
 
     python results/play.py runs/NAME --video
 
-prints the returns of fresh episodes and draws the best of them in the run's folder, as
-strip-STEP.png: the episode, what the model sees of it, and what it dreams after its first five
-images; with --video as episode-STEP.gif too. The run may still be going on.
+prints the returns of the evaluation's episodes (of its seeds, by which best.pt was chosen too), and
+draws the best of them in the run's folder, as strip-STEP.png: the episode, what the model sees of
+it, and what it dreams after its first five images; with --video as episode-STEP.gif too. The run
+may still be going on.
 """
 
 import argparse
@@ -121,7 +122,8 @@ def show(command: argparse.Namespace) -> None:
     each = (f"{r:.1f} ({n:.0f})" for r, n in zip(returns, lengths, strict=True))
     print("returns (and lengths):", *each)
     best = episodes[returns.argmax()]
-    seen, dreamt = open_loop(agent, best, 10_000, 10_000), open_loop(agent, best, frames=25)
+    whole = len(best.states)  # all of it is seen: no dream
+    seen, dreamt = open_loop(agent, best, whole, whole), open_loop(agent, best, frames=25)
     path = folder / f"strip-{name}.png"
     Image.fromarray(strip(seen, dreamt)).save(path)
     print(f"{path}: the episode, what is seen of it, difference; dream from 5 images, difference")

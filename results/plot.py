@@ -2,11 +2,11 @@
 
     python results/plot.py [FOLDER]
 
-draws FOLDER/curves.png (results/ if none is given), one column of panels an environment, one line
-an arm: the mean over its runs and its 95% t-interval, each run as a thin line; above, returns of
-evaluation beside what actions earn that look at nothing; then how much of the environment's own
-state space the collected rows cover; below, that coverage against the agent's own estimate of the
-entropy of its future states, which it maximises. Writes FOLDER/table.md.
+draws FOLDER/curves.png (of results/whole, if none is given), one column of panels an environment,
+one line an arm: the mean over its runs and its 95% t-interval, each run as a thin line; above,
+returns of evaluation beside what actions earn that look at nothing; then how much of the
+environment's own state space the collected rows cover; below, that coverage against the agent's own
+estimate of the entropy of its future states, which it maximises. Writes FOLDER/table.md.
 """
 
 import argparse
@@ -24,8 +24,9 @@ import numpy as np
 from scipy import stats
 
 HERE = Path(__file__).parent
+WHOLE = HERE / "whole"  # the runs of this repository
 sys.path.insert(0, str(HERE.parent))
-from results.baseline import USUAL
+from results.baseline import COLUMNS, USUAL
 from train import ARMS, Patient, default_settings, interval95
 
 # What may differ between runs of one line: who, where and how looked at, not what is learnt.
@@ -35,7 +36,6 @@ NOT_LEARNT = {
 }  # fmt: skip
 POLICIES = {"random": ":", "zero": "--", "constant": "-."}  # of reference.csv, and their lines
 GOALS = {"HopperBulletEnv-v0": 800, "HalfCheetahBulletEnv-v0": 300}  # the speed of learning
-COLUMNS = set("env_steps wall_seconds eval_return eval_interval95 eval_length coverage".split())
 
 
 def label(settings: dict) -> str:
@@ -65,8 +65,8 @@ def read_metrics(path: Path) -> dict[str, np.ndarray]:
     written, or none be there yet. A ValueError, in one sentence, if it is another table."""
     text = path.read_text(errors="replace") if path.is_file() else ""
     rows = list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))
-    if rows and not rows[0].keys() >= COLUMNS:
-        lacking = ", ".join(sorted(COLUMNS - rows[0].keys()))
+    if rows and not rows[0].keys() >= {*COLUMNS}:
+        lacking = ", ".join(sorted({*COLUMNS} - rows[0].keys()))
         raise ValueError(f"{path} is no run's metrics, without {lacking}: left out.")
     try:
         return {name: np.array([float(row[name]) for row in rows]) for name in rows[:1] and rows[0]}
@@ -271,7 +271,8 @@ def main(arguments: list[str]) -> int:
     """Runs a command line. Returns the exit code: 0 done, 2 bad input."""
     says = "Draws all runs below a folder: its curves.png and table.md."
     parser = argparse.ArgumentParser(prog="python results/plot.py", description=says)
-    parser.add_argument("folder", type=Path, nargs="?", default=HERE, help="runs (%(default)s)")
+    add, says = parser.add_argument, "where runs are, however deep (%(default)s)"
+    add("folder", type=Path, nargs="?", default=WHOLE, help=says)
     folder = parser.parse_args(arguments).folder
     mpl.use("Agg")
     try:

@@ -8,6 +8,7 @@ made it in its made_with.json. The same command again skips finished runs and ta
 
 import argparse
 import contextlib
+import dataclasses
 import os
 import re
 import shlex
@@ -59,6 +60,9 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     try:  # what the first run cannot have, none can
         command.list or command.out.mkdir(parents=True, exist_ok=True)
         train.check(train.parse(next(iter(command.runs.values()))).settings.to_json())
+        for folder, options in command.runs.items() if not command.list else ():
+            if others := differing(folder, options):
+                raise ValueError(f"{folder} is of a run with {others}: name another --out.")
     except (ValueError, OSError) as error:
         parser.error(error)
     return command
@@ -71,6 +75,17 @@ def runs(command: argparse.Namespace, options: list[str]) -> dict[Path, list[str
         [*options, f"--steps={command.steps}", f"--env={env}", f"--arm={arm}", f"--seed={seed}"]
         for seed in command.seeds for env in command.envs for arm in command.arms
     }  # fmt: skip
+
+
+def differing(folder: Path, options: list[str]) -> str:
+    """In which settings the run that a folder holds is not of these options: none, if none is."""
+    try:
+        made = dataclasses.asdict(train.read_settings(folder))
+    except (OSError, ValueError):  # none is there, or none that train.py would go on with
+        return ""
+    wanted = dataclasses.asdict(train.parse(options).settings)
+    fixed = made.keys() - {*train.CHANGEABLE}
+    return ", ".join(f"{name} {made[name]}" for name in sorted(fixed) if made[name] != wanted[name])
 
 
 def steps_made(folder: Path, steps: int) -> int:

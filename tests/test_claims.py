@@ -108,17 +108,21 @@ def test_runs_are_held_against_those_of_the_same_settings():
     for arms in runs.values():
         arms["revised, batch_size 10"] = arms.pop("revised")
     assert claims.shared_changes(runs) == []
-    assert "no revised" in claims.report(runs, plot.read_reference())
+    said = claims.report(runs, plot.read_reference())
+    assert "no revised" in said and "no other arm has: revised, batch_size 10." in said
+    assert "no other arm has: dreamer" not in said
     for arms in runs.values():
         arms["dreamer, batch_size 10"] = arms.pop("dreamer")
     assert claims.shared_changes(runs) == [{"batch_size 10"}]
+    assert "Left out" not in claims.report(runs, plot.read_reference())
 
 
-def test_coverage_at_equal_noise_finds_its_runs():
+def test_coverage_without_noise_finds_its_runs():
     runs = made_up(maxent=[7.0, 8, 9], revised=[1.0, 2, 3])
     for arms in runs.values():
         arms["revised, action_noise 0.0"] = arms["revised"]
     assert judged(runs)[5] == SUPPORTED
+    assert "Left out" not in claims.report(runs, plot.read_reference())
 
 
 def test_folders_are_judged_and_bad_ones_end_with_one_sentence(tmp_path, capsys):

@@ -127,6 +127,20 @@ def test_bad_input_ends_with_one_sentence_before_anything_is_made(
     assert not list(tmp_path.glob("runs/figure/*"))
 
 
+def test_a_run_of_other_settings_is_not_taken_for_the_one_asked_for(stand_in, capsys):
+    folder = stand_in / f"{HOPPER}-maxent-seed0"
+    write_run(folder, 3000, "weights.pt")
+    asked = reproduce.train.parse([f"--env={HOPPER}", "--steps=3000", "--eval-episodes=4"])
+    (folder / "settings.json").write_text(asked.settings.to_json())
+    arguments = ["--arms", "maxent", "--envs", HOPPER, "--seeds", "0", "--steps", "3000"]
+    arguments += ["--out", str(stand_in)]
+    assert reproduce.main(arguments) == 0  # evaluated less often, it is the same experiment
+    with pytest.raises(SystemExit) as end:
+        reproduce.main([*arguments, "--", "--horizon", "7"])
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert end.value.code == 2 and "a run with horizon 10: name another --out." in said
+
+
 # ---- what becomes of each ------------------------------------------------------------------------
 
 

@@ -218,6 +218,14 @@ def test_the_verdict_names_what_to_look_at_first(worse, word):
     assert word in diagnose.verdict({"stochastic": GOOD, "deterministic": GOOD | worse})
 
 
+def test_the_verdict_is_on_what_is_evaluated_before_the_explorer():
+    explorer, evaluated = GOOD | {diagnose.REWARDS: 0.1}, GOOD | {diagnose.AFTER: -0.5}
+    said = diagnose.verdict({"stochastic": explorer, "deterministic": evaluated})
+    assert "deterministic actor: rewards are known where" in said
+    said = diagnose.verdict({"stochastic": explorer, "deterministic": GOOD})
+    assert "stochastic actor: the model does not know" in said
+
+
 def test_a_verdict_needs_no_figure_that_short_episodes_lack():
     short = {k: v for k, v in GOOD.items() if k not in (diagnose.AFTER, diagnose.PROMISED)}
     assert "Nothing stands out" in diagnose.verdict({"stochastic": short})
