@@ -1,10 +1,10 @@
 """Actors, critics, exploration and acting: §2.2, §4.1, minor modifications 1, 2 and 4 of §4.2.
 
 The stochastic actor maximises the λ-return plus β times the entropy of the states it will visit;
-the deterministic actor, trained beside it, maximises the λ-return alone (Eq. 7). Each has its own
-critic, fitted on its own imagined sequences, since V and Q are of the *current policy*. The entropy
-comes from mdn.py as a number; what is imagined comes from world_model.py as tensors, time first: H
-steps, N sequences, D state, A action.
+the deterministic actor, trained beside it, maximises the λ-return alone. `actor_loss` is the first
+term of Eq. (7); `train.update_actor` adds the second, from mdn.py. Each actor has its own critic,
+fitted on its own imagined sequences, since V and Q are of the *current policy*. What is imagined
+comes from world_model.py, time first: H steps, N sequences, D state, A action.
 """
 
 import math
@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.distributions import Normal
 
 from returns import lambda_return, survival
-from world_model import mlp
+from world_model import Dream, mlp, regression_error
 
 
 class StochasticActor(nn.Module):
@@ -39,16 +39,17 @@ class StochasticActor(nn.Module):
 
     def distribution(self, state: Tensor) -> Normal:
         """The distribution before the tanh, in float32: (…, D) -> Normal of (…, A)."""
-        mean, std = self.net(state).chunk(2, -1)
-        std = F.softplus(std + math.log(math.exp(5) - 1)) + 1e-4
-        return Normal(5 * torch.tanh(mean / 5), std, validate_args=False)
+        x, y = self.net(state).chunk(2, -1)
+        std = F.softplus(y + math.log(math.exp(5) - 1)) + 1e-4
+        return Normal(5 * torch.tanh(x / 5), std, validate_args=False)
 
     def forward(self, state: Tensor) -> Tensor:
         """A reparametrised sample of π(· | s), in [−1, 1]: (…, D) -> (…, A)."""
         return torch.tanh(self.distribution(state).rsample())
 
-    def mode(self, state: Tensor) -> Tensor:
-        """The action that evaluation takes, tanh(μ): (…, D) -> (…, A)."""
+    def greedy(self, state: Tensor) -> Tensor:
+        """The action that evaluation takes: tanh(μ), the median of π (Dreamer: the likeliest of 100
+        samples): (…, D) -> (…, A)."""
         return torch.tanh(self.distribution(state).mean)
 
 
@@ -67,7 +68,7 @@ class DeterministicActor(nn.Module):
         """The action, in [−1, 1]: (…, D) -> (…, A)."""
         return torch.tanh(5 * torch.tanh(self.raw(state) / 5))
 
-    mode = forward
+    greedy = forward
 
 
 class QCritic(nn.Module):
@@ -94,7 +95,7 @@ class VCritic(nn.Module):
         return self.net(state).squeeze(-1)
 
 
-def imagined_returns(dream, critic: nn.Module, gamma: float, lam: float) -> Tensor:
+def imagined_returns(dream: Dream, critic: nn.Module, gamma: float, lam: float) -> Tensor:
     """R_0 … R_{H−1} of a dream, (H, N), with V(s_k) = Q(s_k, a_k) at its own a_k ~ π(s_k)."""
     value = critic(dream.state[1:], dream.action[1:])
     return lambda_return(dream.reward, dream.continues, value, gamma, lam)
@@ -104,33 +105,30 @@ def actor_loss(returns: Tensor, continues: Tensor, first_state_only: bool) -> Te
     """−R, what an actor minimises but for the entropy: a scalar.
 
     First state only (§4.2): −R_0, averaged over the N starting states. The later actions still
-    receive gradient, through the imagined sequence that R_0 sums over. Otherwise, as in Dreamer,
-    the mean of S_k R_k over all imagined states, S their survival.
+    receive gradient, through the imagined sequence that R_0 sums over. Otherwise, as in Dreamer's
+    paper, the mean of S_k R_k over all imagined states, S their survival (Dreamer's code: γ^k R_k).
     """
     if first_state_only:
         return -returns[0].mean()
     return -(survival(continues) * returns).mean()
 
 
-def critic_loss(critic: nn.Module, dream, returns: Tensor, smooth_l1: bool) -> Tensor:
-    """Regression of the critic on R_0 … R_{H−1}, weighted by survival (§4.2): a scalar. Gradient
-    flows into the critic alone.
+def critic_loss(critic: nn.Module, dream: Dream, returns: Tensor, smooth_l1: bool) -> Tensor:
+    """Regression of the critic on R_0 … R_{H−1}, weighted by survival: a scalar. "First state only"
+    (§4.2) is of the actors alone. Gradient flows into the critic alone.
 
     Smooth L1 with its knee at 1 (minor modification 2), or ½(Q − R)². Smooth L1 does not estimate a
     mean: of returns that are 0 nine times in ten and 10 once it makes 1/9, where the mean is 1.
     """
     value = critic(dream.state[:-1].detach(), dream.action[:-1].detach())
-    target = returns.detach()
-    error = 0.5 * (value - target).square()
-    if smooth_l1:
-        error = F.smooth_l1_loss(value, target, reduction="none")
+    error = regression_error(value, returns.detach(), smooth_l1)
     return (survival(dream.continues) * error).mean()
 
 
 def nudge(action: Tensor, std: float) -> Tensor:
-    """An action with reparametrised noise, clipped to [−1, 1]: what an actor earns in its dream, it
-    then earns in spite of it. It also shows the critic of a deterministic actor actions beside
-    A(s), without which its slope ∂Q/∂a there is chance."""
+    """An action plus reparametrised noise, clipped to [−1, 1]. An actor that learns with it earns
+    despite small errors, and a deterministic actor's critic sees actions beside A(s), without which
+    its slope ∂Q/∂a there is arbitrary."""
     return (action + std * torch.randn_like(action)).clamp(-1, 1)
 
 
@@ -164,7 +162,7 @@ def act(
     """
     rows = np.array(image), np.array(action), np.array(state is None)  # B = T = 1
     rows = [torch.from_numpy(x)[None, None].to(agent.device) for x in rows]
-    # In float32: to cast all weights costs more than one image's products in bfloat16 save.
+    # No autocast: to cast all weights costs more than bfloat16 saves on one image.
     state = agent.model.observe(*rows, previous=state).state[:, 0]
     action = policy(state)[0].cpu().numpy()
     if not np.isfinite(action).all():

@@ -1,5 +1,6 @@
 """Experience: environments seen through their pixels, the replay buffer of what was seen, and
-how much of the environment's own states that covers.
+how much of the environment's own states that covers. `make_env` and `Replay` are what the algorithm
+needs; the rest keeps a stranger's environment from breaking a run.
 
 The observation is the rendered 64×64 image and nothing else (§5). Rows are arrival-indexed: an
 observation stands beside the action that led to it, and the reward and termination received.
@@ -26,7 +27,7 @@ from scipy.special import digamma, gammaln
 
 IMAGE_SIZE = 64
 MAX_REWARD = 1e9  # of one environment step; more is a fault of the environment, not a reward
-MAX_STATES, MAX_DIMENSIONS = 5000, 64  # of `coverage`: a second
+MAX_STATES, MAX_DIMENSIONS = 5000, 64  # at most, in `coverage`: it takes a second
 
 
 @contextlib.contextmanager
@@ -351,5 +352,5 @@ class Replay:
             raise ValueError(f"The replay holds {len(self)} rows, fewer than a window of {length}.")
         first = self.added - len(self) + rng.integers(len(self) - length + 1, size=batch)
         wanted = first[:, None] + np.arange(length)
-        rows = bytearray().join(map(self.read, wanted.flat))
+        rows = bytearray().join(map(self.read, wanted.flat))  # torch wants what it may write to
         return np.frombuffer(rows, self.dtype).reshape(wanted.shape)

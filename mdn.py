@@ -6,10 +6,10 @@ itself at the last one, and the stochastic actor maximises the entropy of P (`en
 the same way; `particle_entropy` needs no network. This file sees tensors of states s = (h, z); it
 knows neither the world model nor the actors. γ here is γ_q, the discount of q, not that of returns.
 
-Departures from print, all shown in tests/test_mdn.py: with termination the printed weights do not
-sum to one; (8) and (9) are off by one step; (10) counts s_t itself, an atom of unbounded likelihood
-in a continuous space, and misses step n. And "importance sampling" is bootstrapping, with the ratio
-q / P taken to be one.
+Departures from print, all but (8)'s shown in tests/test_mdn.py: with termination the printed
+weights do not sum to one; (8) and (9) are off by one step; (10) counts s_t itself, an atom of
+unbounded likelihood in a continuous space, and misses step n. And "importance sampling" is
+bootstrapping, with the ratio q / P taken to be one.
 """
 
 import math
@@ -86,7 +86,7 @@ class MixtureDensityNetwork(nn.Module):
 def discounted_weights(continues: Tensor, gamma: float) -> tuple[Tensor, Tensor]:
     """Weights of the n imagined states and of the bootstrap in q(· | s_t): Eqs. (8) to (10).
 
-        m_0 = 1,  m_k = Π_{j≤k} γ c_{t+j};   w_k = m_{k−1} − m_k,  w_b = m_n;   Σ_k w_k + w_b = 1
+        m_0 = 1,  m_k = Π_{1≤j≤k} γ c_{t+j};   w_k = m_{k−1} − m_k,  w_b = m_n;   Σ_k w_k + w_b = 1
 
     Without termination w_k = (1 − γ) γ^{k−1} and w_b = γ^n; where the episode ends, the unspent
     mass stays.
@@ -126,7 +126,7 @@ def cross_entropy(
     """
     weights, tail_weight = discounted_weights(continues, gamma)
     log_prob = density.log_prob(torch.cat([following, tail.sample_components()]))  # (n + K, N)
-    along, beyond = log_prob.split([len(following), log_prob.shape[0] - len(following)])
+    along, beyond = log_prob[: len(following)], log_prob[len(following) :]
     return -(weights * along).sum(0) - tail_weight * (tail.log_weights.exp().T * beyond).sum(0)
 
 
@@ -152,6 +152,9 @@ def entropy(
 ) -> Tensor:
     """Ĥ of the discounted state distribution, the second term of the objective (7): (N,) nats.
 
+    It is −E_q log P_T = H(q) + KL(q ‖ P_T). Where P_T is q, its gradient in the policy is that of
+    H(q), since KL has its minimum there.
+
     Gradient flows to the policy through the imagined states, their c and s̃ ~ P_T(· | s_{t+n}). It
     could not flow through samples of P_T(· | s_t): those do not depend on what the policy does
     after s_t.
@@ -165,7 +168,7 @@ def entropy(
 
 
 def particle_entropy(states: Tensor, continues: Tensor, gamma: float, k: int = 3) -> Tensor:
-    """Ĥ by distances to neighbours, in the place of `entropy` (ours; the paper's conclusion asks
+    """Ĥ by distances to neighbours, instead of `entropy` (ours; the paper's conclusion asks
     for other models than a network of mixtures): (N,) nats.
 
     Kozachenko and Leonenko's estimate from the distance ε_i of s_{t+i} to its k-th neighbour among

@@ -1,4 +1,4 @@
-"""Returns of an imagined sequence: the λ-return with termination (Eq. 5) and survival (§4.2).
+"""Returns of an imagined sequence: the λ-return with termination (Eq. 5) and survival.
 
 Pure functions of tensors, time first. Everything is arrival-indexed, as the whole code is: row k of
 `reward` and of `continues` belongs to the state s_{t+k+1} that the k-th imagined action led to.
@@ -25,7 +25,7 @@ def lambda_return(
         (H, N) R_0 … R_{H−1}.
 
     Departure from print: the weights of the unnumbered definition above Eq. (5) sum to
-    1 + λ^T (1 − λ). Eq. (5) is right; this is Eq. (5) as a recursion, with c in the place of 1.
+    1 + λ^T (1 − λ). Eq. (5) is right; this is Eq. (5) as a recursion, with c instead of 1.
     """
     shapes = {x.shape for x in (reward, continues, value)}
     assert len(shapes) == 1, shapes
@@ -39,7 +39,8 @@ def lambda_return(
 
 
 def survival(continues: Tensor) -> Tensor:
-    """Probability S that the imagined episode has reached each state (§4.2), without gradient.
+    """Probability S that the imagined episode has reached each state, without gradient: how much
+    what is imagined there counts (ours, where §4.2 has a termination model; Dreamer's code: Π γ).
 
         S_0 = 1;   S_k = c_1 c_2 … c_k
 

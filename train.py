@@ -3,7 +3,9 @@
     python train.py --env HopperBulletEnv-v0
 
 `update` is the paper's algorithm and `train` its loop; what they call follows in the order in which
-they call it. No other file reads settings, holds an optimiser or knows a run's folder.
+they call it. The paper ends with `Agent`; from `join_processes` on come processes, folders,
+checkpoints and the command line. No other of the six files reads settings, holds an optimiser or
+knows a run's folder.
 """
 
 import atexit
@@ -46,10 +48,10 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 import actors
-from actors import Episode, act, actor_loss, critic_loss, explore, imagined_returns, nudge, play
+from actors import act, actor_loss, critic_loss, explore, imagined_returns, nudge, play
 from env import EnvironmentFault, Replay, coverage, make_env
 from mdn import MixtureDensityNetwork, entropy, mdn_loss, particle_entropy, soft_update
-from world_model import WorldModel, share_of
+from world_model import Dream, WorldModel, share_of
 
 Arm = Literal["dreamer", "dreamer-maxent", "revised", "maxent"]
 Preset = Literal["small", "paper"]
@@ -106,7 +108,7 @@ class Settings:
     batch_size: Size = 50  # sequences a batch (Dreamer: 50)
     length: Annotated[Size, Interval(ge=2)] = 50  # rows a sequence (Dreamer: 50)
     burn_in: Whole = 0  # rows of one begun mid-episode: no reward, end or dream is of them (ours)
-    heads_ahead: Whole = 0  # steps of dreams along recorded actions that teach the heads too (ours)
+    heads_ahead: Whole = 0  # steps of dreams in which rewards and ends are learnt too (ours)
     decode_share: Share = 1.0  # of a batch's images, those that are decoded (Dreamer: all)
     horizon: Size = 15  # imagined steps, and n of Eq. (10) (Dreamer)
     starts: Share = 1.0  # of a batch's live states, those that actors dream on from (Dreamer: all)
@@ -123,7 +125,7 @@ class Settings:
     target_rate: Share = 0.1  # soft update of the target MDN (§5)
     dream_noise: Amount = 0.0  # std of noise on imagined actions (ours)
     detach_policy: bool = True  # no gradient through what the policy sees in its dream (Dreamer)
-    action_penalty: Amount = 0.0  # on actions squared before their tanh, lest it saturate (ours)
+    action_penalty: Amount = 0.0  # × Σ x², x an action before its bounds, lest it saturate (ours)
     model_lr: Amount = 6e-4  # Adam's learning rate of the world model (Dreamer)
     actor_lr: Amount = 8e-5  # of each actor (Dreamer)
     critic_lr: Amount = 8e-5  # of each critic (Dreamer)
@@ -148,7 +150,7 @@ ORIGINAL = dict(
     termination=False, fixed_prior=False, q_critic=False, smooth_l1=False,
     decode_stoch_only=False, first_state_only=False, stoch=30, random_action=0.0,
 )
-ARMS = {  # what each curve of the paper's figure changes in `Settings`, which is the last of them
+ARMS = {  # what each curve of the paper's figure changes in `Settings`, whose own are `maxent`'s
     "dreamer": ORIGINAL | dict(entropy=False, deterministic_actor=False, action_noise=0.3),
     "dreamer-maxent": ORIGINAL,
     "revised": dict(entropy=False, deterministic_actor=False, action_noise=0.3),
@@ -187,7 +189,7 @@ def update(
         named metrics; the world model's are the unweighted terms of its loss. A FloatingPointError
         names those that are not finite; from the first such gradient on, nothing was changed.
     """
-    # Asked for first: a GPU has nothing under way that this waits for.
+    # First, while a GPU is idle: `nonzero` waits for all that it has under way.
     live = live_rows(agent, batch)
     weights = {
         "image": s.image_weight, "reward": s.reward_weight, "termination": s.termination_weight,
@@ -244,7 +246,7 @@ def update_actor(
     metrics: dict[str, Tensor], look: bool,
 ) -> None:  # fmt: skip
     """An actor dreams on from starts (N, D), learns from its dream, and so do its critic and the
-    MDN: Eq. (7) for the stochastic actor, R_0 alone for the deterministic one."""
+    MDN: Eq. (7) for the stochastic actor, its first term alone for the deterministic one."""
     actor, critic = agent.actors[name], agent.critics[name]
     with_entropy = name == "stochastic" and s.entropy
     with agent.autocast():
@@ -260,7 +262,7 @@ def update_actor(
         loss = sum(terms.values()) + penalty
     metrics[f"{name}_actor/return"] = returns[0].mean()
     metrics[f"{name}_actor/saturated"] = (dream.action.abs() > 0.99).float().mean()
-    metrics[f"{name}_actor/deviation"] = actor.mode(starts).detach().std(0, correction=0).mean()
+    metrics[f"{name}_actor/deviation"] = actor.greedy(starts).detach().std(0, correction=0).mean()
     if name == "stochastic":
         metrics["stochastic_actor/sigma"] = actor.distribution(starts).stddev.mean()
     agent.step(f"{name}_actor", loss, metrics, len(starts))
@@ -276,8 +278,8 @@ def update_actor(
 
 
 def dreaming(agent: "Agent", name: str, s: Settings) -> Callable[[Tensor], Tensor]:
-    """What an actor does in its dreams, states (N, D) to actions (N, A), with `dream_noise`: with
-    `detach_policy` no gradient leaves through what it sees."""
+    """What an actor does in its dreams, states (N, D) to actions (N, A): its action plus
+    `dream_noise`; with `detach_policy` no gradient goes back into the states that it sees."""
     actor = agent.actors[name]
 
     def policy(state: Tensor) -> Tensor:
@@ -287,7 +289,7 @@ def dreaming(agent: "Agent", name: str, s: Settings) -> Callable[[Tensor], Tenso
     return policy
 
 
-def future_entropy(agent: "Agent", dream) -> Tensor:
+def future_entropy(agent: "Agent", dream: Dream) -> Tensor:
     """Ĥ of Eq. (7), the mean over a dream's starts: by the MDN, or by neighbours (`density`)."""
     s = agent.s
     if s.density == "knn":  # on z alone: h has no scale of its own
@@ -298,7 +300,7 @@ def future_entropy(agent: "Agent", dream) -> Tensor:
 def measure_gradients(
     actor: nn.Module, terms: dict[str, Tensor], metrics: dict[str, Tensor], count: int
 ) -> None:
-    """The norms of the gradients of R_0 and of βĤ, Eq. (7), apart: which of them leads."""
+    """The norms of the gradients of the two terms of Eq. (7), apart: which of them leads."""
     for name, term in terms.items():
         gradients = torch.autograd.grad(term, list(actor.parameters()), retain_graph=True)
         average_over_processes(gradients, count)
@@ -314,7 +316,7 @@ def train(run: "Run", stop: Callable[[], bool]) -> None:
     """
     s, agent, env, replay = run.s, run.agent, run.env, run.replay
     while not any(gathered(stop())):
-        # `updates` of them belong before each multiple of `train_every` from `prefill` on.
+        # At each multiple of `train_every` from `prefill` on, `updates` of them are due.
         if run.updates < s.updates * passed(s.prefill - 1, run.step, s.train_every):
             rows = replay.sample(s.batch_size // processes(), s.length, run.rng)
             batch, beta = to_tensors(rows, agent.device), beta_at(run.step, s)
@@ -331,7 +333,7 @@ def train(run: "Run", stop: Callable[[], bool]) -> None:
                 action = run.rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
             else:
                 last = replay.last
-                policy = agent.players["stochastic"] if run.explores else agent.evaluated.mode
+                policy = agent.players["stochastic"] if run.explores else agent.evaluated.greedy
                 action, run.state = act(agent, policy, last["image"], last["action"], run.state)
                 if run.explores:
                     action = explore(action, s.action_noise, s.random_action, run.rng)
@@ -361,19 +363,20 @@ def beta_at(step: int, s: Settings) -> float:
     return s.beta_start + (s.beta_end - s.beta_start) * min(step / s.steps, 1.0)
 
 
-def evaluate(agent: "Agent", env, s: Settings, show=lambda text: None) -> list[Episode]:
-    """This process's share of the episodes of the evaluated actor's mode, each with a seed of its
-    own, always the same. One in which the environment fails is left out."""
+def evaluate(agent: "Agent", env, s: Settings, show=lambda text: None) -> list[tuple[float, int]]:
+    """Return and length of this process's share of the episodes of the evaluated actor's greedy
+    actions, each with a seed of its own, always the same. One in which the environment fails is
+    left out."""
     episodes = []
     for k in range(rank(), s.eval_episodes, processes()):
         show(f"evaluating, episode {k + 1} of {s.eval_episodes}")
         seed = 2**31 - 1 - k  # some environments take none that is larger
         try:
-            episode = play(agent, env, agent.evaluated.mode, seed, s.eval_max_steps)
+            episode = play(agent, env, agent.evaluated.greedy, seed, s.eval_max_steps)
         except EnvironmentFault as error:  # what only measures never stops a run
             say(f"An evaluation's episode is left out: {error}")
             continue
-        episodes.append(episode._replace(images=None, actions=None, rewards=None, states=None))
+        episodes.append((episode.total, episode.length))
     return episodes
 
 
@@ -435,9 +438,9 @@ class Agent(nn.Module):
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16)
 
     def step(self, name: str, loss: Tensor, metrics: dict[str, Tensor], count: int = 1) -> None:
-        """One step of the named optimiser on `loss`, a mean of so many; the gradient's norm goes
-        into `metrics`: not finite if it or the loss is not, in any process. Where one is not, of
-        this step or before it, nothing is changed."""
+        """One step of the named optimiser on `loss`, this process's mean over `count` things. The
+        gradient's norm goes into `metrics`, not finite if it or the loss is not, in any process;
+        from the first such norm in them on, no step changes anything."""
         optimiser = self.optimisers[name]
         parameters = optimiser.param_groups[0]["params"]
         optimiser.zero_grad()
@@ -501,8 +504,8 @@ def gathered(thing: Any) -> list:
 
 
 def average_over_processes(tensors: list[Tensor], count: int) -> None:
-    """Put in the place of each its mean over all processes, each weighted by its count, in one
-    message: of gradients of means of so many, that is the gradient of the mean of all."""
+    """Replace each by its mean over processes, weighted by their counts, in one message: of
+    gradients of means over so many things, that is the gradient of the mean over all."""
     if processes() == 1:
         return
     flat = torch.cat([x.flatten() for x in tensors] + [tensors[0].new_ones(1)]) * count
@@ -622,10 +625,10 @@ class Run:
         at_end = self.step >= self.s.steps and self.step > self.evaluated_at
         return self.updates > 0 and (at_end or passed(since, self.step, self.s.eval_every) > 0)
 
-    def report(self, episodes: list[Episode]) -> None:
+    def report(self, episodes: list[tuple[float, int]]) -> None:
         """A row of metrics.csv and TensorBoard, a line, and best.pt if none was better."""
         self.evaluated_at = self.step
-        own = [(e.total, e.length) for e in episodes], self.visited, self.metrics
+        own = episodes, self.visited, self.metrics
         scores, visited, metrics = zip(*gathered(own), strict=True)
         if not any(scores):
             return
@@ -719,7 +722,7 @@ class Run:
         if self.agent.device.type == "cuda":
             torch.cuda.set_rng_state_all(saved["cuda_random"])
         for name in changed:
-            since = f"{name}: {now[name]} in the place of {made[name]} from step {self.step:,} on"
+            since = f"{name}: {now[name]} instead of {made[name]} from step {self.step:,} on"
             say(since + ("; β now falls to its end by then." if name == "steps" else "."))
 
     def retrace(self) -> None:

@@ -20,7 +20,7 @@ first in imagination (H, N, …).
 """
 
 from collections.abc import Callable
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import NamedTuple
 
 import torch
@@ -179,6 +179,13 @@ def mlp(inputs: int, units: int, layers: int, outputs: int, norm=False) -> nn.Se
     return nn.Sequential(*hidden, Float32Linear(sizes[-1], outputs))
 
 
+def regression_error(predicted: Tensor, target: Tensor, smooth_l1: bool) -> Tensor:
+    """Smooth L1 with its knee at 1 (§4.2, minor 2), or ½(x − y)²: (…), (…) -> (…)."""
+    if smooth_l1:
+        return F.smooth_l1_loss(predicted, target, reduction="none")
+    return 0.5 * F.mse_loss(predicted, target, reduction="none")
+
+
 class WorldModel(nn.Module):
     """The recurrent state-space model with its encoder, decoder and heads.
 
@@ -189,15 +196,16 @@ class WorldModel(nn.Module):
         units: units of the reward and termination heads.
         depth: channels of the first convolution.
         termination: learn when episodes end (§4.2); without it c = 1 everywhere.
-        fixed_prior: KL to N(0, 1) and Jeffreys to the learnt prior (§4.2), in the place of KL to
-            the learnt prior.
-        smooth_l1: Smooth L1 loss of the reward (§4.2, minor 2), in the place of ½(r − r')².
-        decode_stoch_only: the decoder sees z alone (§4.2, minor 3), in the place of (h, z).
+        fixed_prior: KL to N(0, 1) and Jeffreys to the learnt prior (§4.2), instead of KL to the
+            learnt prior.
+        smooth_l1: Smooth L1 loss of the reward (§4.2, minor 2), instead of ½(r − r')².
+        decode_stoch_only: the decoder sees z alone (§4.2, minor 3), instead of (h, z).
         decode_share: of a batch's images, those that are decoded, drawn at random (ours).
         burn_in: first rows of a sequence that begins within an episode, whose h does not hold what
             came before: they teach no reward and no end (ours; the idea is R2D2's).
         heads_ahead: steps of dreams along recorded actions in which rewards and ends are learnt
-            too, since actors ask for them there (ours; 0: in what was seen alone).
+            too, since actors ask for them there; their gradient passes through the prior into all
+            that came before (ours; 0: in what was seen alone).
         observe_first: z_0 is inferred from o_0, so a_0 depends on it (§4.2). Without it s_0 is
             zero and o_0 is never seen.
         free_nats: KL below which there is nothing to gain (Dreamer); with `fixed_prior` unused.
@@ -254,7 +262,7 @@ class WorldModel(nn.Module):
         deter, stoch = previous.split([self.deter, self.stoch], -1)
         deters, stochs, statistics = [], [], []
         # In float32: for so few rows a product costs less than its casts. With its gradient,
-        # `observe` takes 68 ms in the place of 78 (small preset, one thread).
+        # `observe` takes 68 ms instead of 78 (small preset, one thread).
         with torch.autocast(image.device.type, enabled=False):
             for t in range(length):
                 # h_0 = 0: nothing of the episode before passes, nor of its z, which is in h alone
@@ -270,11 +278,22 @@ class WorldModel(nn.Module):
         return Observed(state, normal(torch.stack(statistics, 1)), normal(self.prior_net(deter)))
 
     def settled(self, is_first: Tensor) -> Tensor:
-        """Which rows of sequences (B, T) the states know enough of, bool: those whose episode began
-        in the sequence, and of others all but the first `burn_in`."""
+        """Which rows (B, T) have a state that has seen enough to be learnt from, bool: those whose
+        episode began in the sequence, and of others all but the first `burn_in`."""
         known = is_first.cumsum(1) > 0
         known[:, self.burn_in :] = True
         return known
+
+    def step(self, state: Tensor, action: Tensor) -> Tensor:
+        """s_{t+1} after s_t and a_t, by the prior: (N, D), (N, A) -> (N, D)."""
+        deter, stoch = state.split([self.deter, self.stoch], -1)
+        deter = self.recur(deter, stoch, self.dense_action(action))
+        return torch.cat([deter, normal(self.prior_net(deter)).rsample()], -1)
+
+    def along(self, start: Tensor, actions: Tensor) -> Tensor:
+        """The states of a dream in which these actions are taken, whatever is met: (N, D),
+        (H, N, A) -> (H + 1, N, D) s_0 … s_H."""
+        return torch.stack([*accumulate(actions, self.step, initial=start)])
 
     def imagine(self, start: Tensor, policy: Callable[[Tensor], Tensor], horizon: int) -> Dream:
         """H steps from N states through the prior, differentiable in the policy's actions.
@@ -284,12 +303,9 @@ class WorldModel(nn.Module):
             policy: states (N, D) to actions (N, A).
             horizon: H.
         """
-        deter, stoch = start.split([self.deter, self.stoch], -1)
         states, actions = [start], [policy(start)]
         for _ in range(horizon):
-            deter = self.recur(deter, stoch, self.dense_action(actions[-1]))
-            stoch = normal(self.prior_net(deter)).rsample()
-            states.append(torch.cat([deter, stoch], -1))
+            states.append(self.step(states[-1], actions[-1]))
             actions.append(policy(states[-1]))
         state = torch.stack(states)
         return Dream(
@@ -314,18 +330,19 @@ class WorldModel(nn.Module):
         return state[..., self.deter :] if self.decode_stoch_only else state
 
     def loss(self, batch: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
-        """The loss as named, unweighted means over batch and time: Eqs. (3), (4) and §4.2.
+        """The loss as named terms, unweighted, means over batch and time: Eqs. (3), (4) and §4.2.
 
             image        ½ Σ (o − o')² over pixels; of `decode_share` of the images
             reward       Smooth L1, or ½ (r − r')²; of settled rows; first ones have none
             termination  binary cross-entropy on `terminated`, never on `truncated`; likewise
-                         both: in (h, z ~ posterior), and with `heads_ahead` in dreams too
+                         both: in (h, z ~ posterior); with `heads_ahead` plus the mean in dreams
             kl_standard  KL(posterior ‖ N(0, 1)), which gives the prior no gradient (§4.2)
             jeffreys     KL(posterior ‖ prior) + KL(prior ‖ posterior) (§4.2)
-            kl           max(KL(posterior ‖ prior), free nats), Dreamer's, in place of the last two
+            kl           max(KL(posterior ‖ prior), free nats), Dreamer's, for the last two
 
-        Departures from print: the sign before KL in (4); the prior of step t + 1 in (3) lacks the
-        action, which h_{t+1} holds.
+        Departures from print: (4) has the squared errors with the sign of (3)'s log-likelihoods, by
+        which they would be maximised; the prior of step t + 1 in (3) lacks the action, which
+        h_{t+1} holds.
 
         Args:
             batch: image (B, T, 64, 64, 3) uint8; action (B, T, A); the flags and reward (B, T).
@@ -338,8 +355,8 @@ class WorldModel(nn.Module):
         seen = torch.ones_like(arrived) if self.observe_first else arrived
         taught = arrived * self.settled(batch["is_first"])
         some = share_of(seen.numel(), self.decode_share, seen.device)
-        z, pixels = self.decoded(observed.state).flatten(0, 1), batch["image"].flatten(0, 1)
-        image = self.decoder.nll(z[some], pixels[some])
+        shown, pixels = self.decoded(observed.state).flatten(0, 1), batch["image"].flatten(0, 1)
+        image = self.decoder.nll(shown[some], pixels[some])
         terms = {"image": masked_mean(image, seen.flatten()[some])}
         terms |= self.head_losses(observed.state, batch, taught)
         if self.heads_ahead:
@@ -352,11 +369,7 @@ class WorldModel(nn.Module):
     ) -> dict[str, Tensor]:
         """The terms reward and termination of `loss` in states (…, D), of rows where `taught` (…)
         is 1."""
-        pair = self.predict_reward(state), batch["reward"]
-        if self.smooth_l1:
-            loss = F.smooth_l1_loss(*pair, reduction="none")
-        else:
-            loss = 0.5 * F.mse_loss(*pair, reduction="none")
+        loss = regression_error(self.predict_reward(state), batch["reward"], self.smooth_l1)
         terms = {"reward": masked_mean(loss, taught)}
         if self.termination is not None:
             logit, terminated = self.termination(state).squeeze(-1), batch["terminated"]
@@ -376,17 +389,16 @@ class WorldModel(nn.Module):
         first = (length - 1) % steps
         starts = slice(first, -1, steps)
 
-        def along(rows: Tensor) -> Tensor:
+        def recorded(name: str) -> Tensor:
             """(B, T, …) -> (steps, N, …): what came, in all N dreams."""
-            return rows[:, first + 1 :].unflatten(1, (-1, steps)).flatten(0, 1).transpose(0, 1)
+            rows = batch[name][:, first + 1 :]
+            return rows.unflatten(1, (-1, steps)).flatten(0, 1).transpose(0, 1)
 
-        actions = along(batch["action"])
-        taken = iter([*actions, actions[-1]])  # the last one is chosen, not taken
-        dream = self.imagine(state[:, starts].flatten(0, 1), lambda _: next(taken), steps)
-        came = {name: along(batch[name]) for name in ("reward", "terminated", "is_first")}
+        dreamt = self.along(state[:, starts].flatten(0, 1), recorded("action"))[1:]
+        came = {name: recorded(name) for name in ("reward", "terminated", "is_first")}
         taught = self.settled(batch["is_first"])[:, starts].flatten()
         taught = taught * (~came["is_first"]).cumprod(0)
-        return self.head_losses(dream.state[1:], came, taught)
+        return self.head_losses(dreamt, came, taught)
 
     def divergences(self, posterior: Normal, prior: Normal, seen: Tensor) -> dict[str, Tensor]:
         """The terms of `loss` that hold the posterior to the prior, in nats, summed over z."""
@@ -413,8 +425,10 @@ def share_of(count: int, share: float, device: torch.device) -> Tensor | slice:
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
     """Mean of x where mask is 1, in the whole batch; 0 where it is nowhere."""
     both = torch.stack([(x * mask).sum(), mask.sum()])
-    if dist.is_initialized():  # the gradients of the processes that share the batch are averaged
-        mean = both.detach().clone()
-        dist.all_reduce(mean)
-        both = both + (mean / dist.get_world_size() - both.detach())
+    if dist.is_initialized():
+        # Both sums' values averaged over the processes that share the batch; of the gradient each
+        # has its own rows' part, and `Agent.step` averages those.
+        total = both.detach().clone()
+        dist.all_reduce(total)
+        both = both + (total / dist.get_world_size() - both.detach())
     return both[0] / both[1].clamp(min=1e-6)  # averaged, a number may be less than 1

@@ -126,7 +126,7 @@ def measure(agent: Agent, name: str, episode: Episode) -> dict[str, np.ndarray]:
         survival = dream.continues[:, -len(left) :].cumprod(0).cpu()
         found["outlived"] = survival[left - 1 + LATE, torch.arange(len(left))].numpy()
     found["saturated"] = np.abs(episode.actions) > 0.99
-    found["greedy"] = actor.mode(states[:-1]).cpu().numpy()
+    found["greedy"] = actor.greedy(states[:-1]).cpu().numpy()
     if hasattr(actor, "distribution"):
         found["sigma"] = actor.distribution(states[:-1]).stddev.cpu().numpy()
     seen = to_levels(model.decoder(model.decoded(states[1:])))
@@ -145,12 +145,11 @@ def follow(model, states: Tensor, images: Tensor, actions: Tensor, rewards: Tens
         the last image seen.
     """
     begun = slice(0, len(rewards) - OPEN_LOOP, 5)
-    taken = iter(windows(actions, OPEN_LOOP + 1)[:, begun])  # the last one is chosen, not taken
-    dream = model.imagine(states[begun], lambda _: next(taken), OPEN_LOOP)
-    both = dream.reward.cpu(), windows(rewards, OPEN_LOOP)[:, begun]
-    picture = to_levels(model.decoder(model.decoded(dream.state[1:]).flatten(0, 1)))
+    dreamt = model.along(states[begun], windows(actions, OPEN_LOOP)[:, begun])[1:]
+    both = model.predict_reward(dreamt).cpu(), windows(rewards, OPEN_LOOP)[:, begun]
+    picture = to_levels(model.decoder(model.decoded(dreamt).flatten(0, 1)))
     truth = windows(images[1:], OPEN_LOOP)[:, begun].float()
-    pictures = picture.unflatten(0, dream.reward.shape), images[begun].float()
+    pictures = picture.unflatten(0, dreamt.shape[:2]), images[begun].float()
     errors = [(x - truth).square().mean((2, 3, 4)) for x in pictures]
     return {
         "open_reward": torch.stack(both, -1).transpose(0, 1).numpy(),

@@ -65,12 +65,12 @@ def open_loop(agent: train.Agent, episode: Episode, frames: int, context: int = 
     """
     frames = min(frames, len(episode.states))
     context = min(context, frames)
-    actions = iter(torch.from_numpy(episode.actions[context - 1 :]).to(agent.device).split(1))
+    actions = torch.from_numpy(episode.actions[context - 1 : frames - 1]).to(agent.device)
     with agent.autocast(), torch.random.fork_rng():
         torch.manual_seed(0)
         start = episode.states[context - 1 : context]
-        dream = agent.model.imagine(start, lambda _: next(actions), frames - context)
-        states = torch.cat([episode.states[:context], dream.state[1:, 0]])
+        dreamt = agent.model.along(start, actions.unsqueeze(1))[1:, 0]
+        states = torch.cat([episode.states[:context], dreamt])
         prediction = agent.model.decoder(agent.model.decoded(states))
     prediction = (255 * (prediction + 0.5)).clamp(0, 255).byte().cpu().numpy()
     truth = episode.images[:frames]
@@ -112,7 +112,7 @@ def show(command: argparse.Namespace) -> None:
         raise ValueError(f"{folder} has no {command.actor} actor: leave out --actor.")
     actor = agent.evaluated if command.actor == "evaluated" else agent.players[command.actor]
     seeds = [2**31 - 1 - k for k in range(command.episodes)]  # those of every evaluation
-    episodes = [play(agent, env, actor.mode, seed, s.eval_max_steps) for seed in seeds]
+    episodes = [play(agent, env, actor.greedy, seed, s.eval_max_steps) for seed in seeds]
     returns, lengths = np.array([(e.total, e.length) for e in episodes]).T
     spread = f" ± {train.interval95(returns):.1f} (95% interval)" if len(returns) > 1 else ""
     print(

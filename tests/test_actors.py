@@ -64,7 +64,9 @@ def test_policy_before_the_tanh_has_a_bounded_mean_and_a_positive_deviation():
 @pytest.mark.parametrize("actor", [StochasticActor(6, 2, 8), DeterministicActor(6, 2, 8)])
 def test_raw_is_what_the_bounds_act_on(actor):
     state = torch.randn(5, 6)
-    torch.testing.assert_close(actor.mode(state), torch.tanh(5 * torch.tanh(actor.raw(state) / 5)))
+    torch.testing.assert_close(
+        actor.greedy(state), torch.tanh(5 * torch.tanh(actor.raw(state) / 5))
+    )
 
 
 def test_actions_are_the_tanh_of_a_normal():
@@ -81,7 +83,7 @@ def test_actions_and_modes_stay_within_one(kind):
     actor = kind(6, 2, 32)
     actor.net[-1].weight.data *= 1e4
     state = torch.randn(200, 6)
-    for action in (actor(state), actor.mode(state)):
+    for action in (actor(state), actor.greedy(state)):
         assert action.shape == (200, 2) and action.abs().max() <= 1
         assert action.abs().max() > 0.99
 
@@ -91,7 +93,7 @@ def test_mode_is_the_tanh_of_the_mean_and_the_deterministic_action_is_the_same_f
     stochastic = always(StochasticActor(6, 2, 32), 1.0, -4.0, 0.0, 0.0)
     deterministic = always(DeterministicActor(6, 2, 32), 1.0, -4.0)
     state = torch.randn(6)
-    for action in (stochastic.mode(state), deterministic(state), deterministic.mode(state)):
+    for action in (stochastic.greedy(state), deterministic(state), deterministic.greedy(state)):
         np.testing.assert_allclose(action.detach(), [0.7560273, -0.9973903], rtol=1e-5)
 
 
@@ -165,7 +167,7 @@ def test_later_actions_receive_gradient_from_the_first_return():
 
 
 def test_all_states_count_by_their_survival():
-    """Dreamer's loss: (1 · 1 + ½ · 10 + ½ · 0 · 100) / 3, with no gradient through survival."""
+    """Dreamer's paper's: (1 · 1 + ½ · 10 + ½ · 0 · 100) / 3, with no gradient through survival."""
     continues = torch.tensor([[0.5], [0.0], [1.0]], requires_grad=True)
     returns = torch.tensor([[1.0], [10.0], [100.0]], requires_grad=True)
     loss = actor_loss(returns, continues, first_state_only=False)

@@ -219,7 +219,7 @@ def test_first_action_depends_on_the_first_observation_unless_blind(observe_firs
     for pixel in (0, 255):
         torch.manual_seed(0)
         image, zeros = np.full((64, 64, 3), pixel, np.uint8), np.zeros(ACTIONS, np.float32)
-        actions.append(act(agent, agent.evaluated.mode, image, zeros, None)[0])
+        actions.append(act(agent, agent.evaluated.greedy, image, zeros, None)[0])
     assert (actions[0] != actions[1]).all() == observe_first
     assert np.array_equal(*actions) != observe_first
 

@@ -313,12 +313,12 @@ def test_an_action_that_is_not_finite_is_not_the_environments_fault(
 ):
     folder = tmp_path / "run"
 
-    def mode(actor, state):
+    def greedy(actor, state):
         checkpoints.update(contents(folder))
         return state[..., :2] * float("nan")
 
     checkpoints = {}
-    monkeypatch.setattr("actors.DeterministicActor.mode", mode)
+    monkeypatch.setattr("actors.DeterministicActor.greedy", greedy)
     name = register(Base)
     assert train.main(["--env", name, "--run-dir", str(folder), *FAST]) == 1
     said = capfd.readouterr().err
@@ -400,8 +400,8 @@ def test_a_finished_run_can_be_made_longer_and_says_what_changed(stub_run, capsy
     before = metrics(stub_run)
     assert train.main(["--resume", str(stub_run), "--steps", "180", "--actor-lr", "1e-5"]) == 0
     said = capsys.readouterr().err
-    assert "steps: 180 in the place of 120" in said and "β" in said
-    assert "actor_lr: 1e-05 in the place of 0.0002" in said
+    assert "steps: 180 instead of 120" in said and "β" in said
+    assert "actor_lr: 1e-05 instead of 0.0002" in said
     rows = metrics(stub_run)
     assert rows[: len(before)] == before and int(rows[-1]["env_steps"]) == 180
     assert json.loads((stub_run / "settings.json").read_text())["actor_lr"] == 1e-5
@@ -422,9 +422,9 @@ def test_a_rate_edited_in_settings_json_is_said(stub_run, capsys):
     path.write_text(json.dumps(json.loads(path.read_text()) | {"model_lr": 1e-5}), "utf-8-sig")
     assert train.main(["--resume", str(stub_run), "--steps", "180"]) == 0
     said = capsys.readouterr().err
-    assert "model_lr: 1e-05 in the place of 0.0006 from step 120 on." in said
+    assert "model_lr: 1e-05 instead of 0.0006 from step 120 on." in said
     assert train.main(["--resume", str(stub_run)]) == 0
-    assert "in the place of" not in capsys.readouterr().err
+    assert "instead of" not in capsys.readouterr().err
 
 
 def test_steps_below_what_was_done_end_the_run_and_lose_nothing(stub_run, capsys):
@@ -436,8 +436,7 @@ def test_steps_below_what_was_done_end_the_run_and_lose_nothing(stub_run, capsys
 
 def test_best_is_of_the_whole_run_also_after_it_was_resumed(register, tmp_path, monkeypatch):
     returns, best = iter([3.0, 9.0, 5.0, 9.0]), []
-    one = train.Episode(*[None] * 5, total=0.0, length=1)
-    monkeypatch.setattr("train.evaluate", lambda *_: [one._replace(total=next(returns))])
+    monkeypatch.setattr("train.evaluate", lambda *_: [(next(returns), 1)])
     folder = tmp_path / "run"
     assert train.main(["--env", register(Base), "--run-dir", str(folder), *FAST]) == 0
     for steps in ("180", "240"):
@@ -667,7 +666,7 @@ def test_the_best_evaluations_networks_are_kept(register, tmp_path, monkeypatch)
 
     def evaluate(agent, env, s, show):
         states.append({k: v.clone() for k, v in agent.state_dict().items()})
-        return [train.Episode(*[None] * 5, total=next(returns), length=1)]
+        return [(next(returns), 1)]
 
     monkeypatch.setattr("train.evaluate", evaluate)
     folder = tmp_path / "run"

@@ -150,7 +150,7 @@ def test_only_the_explorers_actions_are_disturbed(
     seen = []  # who acts, and whether the action before was a disturbed one
 
     def acting(agent, policy, image, action, state):
-        who = {agent.players["stochastic"]: "E", agent.evaluated.mode: "A"}[policy]
+        who = {agent.players["stochastic"]: "E", agent.evaluated.greedy: "A"}[policy]
         seen.append((who, bool((action == 1).all())))
         return actors.act(agent, policy, image, action, state)
 
