@@ -65,7 +65,7 @@ LEARNING = {
     "critic_lr": (5e-4, 8e-5),
     "critic_norm": (True, False), "actor_lr": (2e-4, 8e-5), "horizon": (10, 15),
     "play_rate": (0.01, 1.0), "termination_weight": (100.0, 10.0), "decode_share": (0.25, 1.0),
-    "dream_noise": (0.3, 0.0), "collect": ("both", "explorer"), "heads_ahead": (5, 0),
+    "dream_noise": (0.3, 0.0), "collect": ("both", "explorer"), "ends_ahead": (5, 0),
     "burn_in": (2, 0),
 }  # fmt: skip
 ACTIONS = 2
@@ -408,11 +408,11 @@ def test_beta_moves_the_stochastic_actor_and_not_the_deterministic_one():
         assert changed(snapshot(one), snapshot(other)) == {"stochastic_actor", "stochastic_player"}
 
 
-def test_heads_ahead_reach_the_model():
-    (_, alone), (agent, both) = (updated(tiny("maxent", heads_ahead=n)) for n in (0, 2))
-    assert agent.model.heads_ahead == 2
-    for name in ("model/reward", "model/termination"):
-        assert both[name] > 1.5 * alone[name]  # of two untrained guesses alike
+def test_ends_ahead_reach_the_model():
+    (_, alone), (agent, both) = (updated(tiny("maxent", ends_ahead=n)) for n in (0, 2))
+    assert agent.model.ends_ahead == 2
+    assert both["model/termination"] > 1.5 * alone["model/termination"]  # of two guesses alike
+    assert both["model/reward"] == alone["model/reward"]
 
 
 def test_terminal_states_start_no_dream():
