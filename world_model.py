@@ -203,8 +203,8 @@ class WorldModel(nn.Module):
         decode_share: of a batch's images, those that are decoded, drawn at random (ours).
         burn_in: first rows of a sequence that begins within an episode, whose h does not hold what
             came before: they teach no reward and no end (ours; the idea is R2D2's).
-        ends_ahead: steps of dreams along recorded actions in which ends are learnt too, since
-            actors ask for them there; the gradient passes through the prior into all that came
+        ends_ahead: steps of dreams along recorded actions in which ends are learnt too, since that
+            is where actors use them; the gradient passes through the prior into all that came
             before (ours; 0: in what was seen alone).
         observe_first: z_0 is inferred from o_0, so a_0 depends on it (§4.2). Without it s_0 is
             zero and o_0 is never seen.
@@ -380,7 +380,7 @@ class WorldModel(nn.Module):
         They take `ends_ahead` steps each, fewer in a shorter sequence, one after the other, up to
         the last row. One from an unsettled state teaches nothing, nor does any beyond its episode.
         Gradients pass into the states (B, T, D) that they start from. Where rewards were learnt
-        there too, HalfCheetah learnt later (results/trials.md, section N).
+        there too, HalfCheetah learnt later (one seed; results/trials.md, section N).
         """
         length = state.shape[1]
         steps = min(self.ends_ahead, length - 1)

@@ -156,9 +156,10 @@ def report(runs: dict, reference: dict) -> str:
         lines += [""]
     names = {n for of in CLAIMS.values() for _, group in of for one in group for n in one.signs}
     held = {(arm, own | c) for arm, own in map(changes, names) for c in configurations}
-    alone = sorted({label for of in runs.values() for label in of if changes(label) not in held})
-    lines += [f"Left out, of settings that no other arm has: {label}." for label in alone]
-    return "\n".join(lines)
+    ours = {label for of in runs.values() for label in of if changes(label)[0] in ARMS}
+    alone = sorted(label for label in ours if changes(label) not in held)
+    lines += [f"Left out, no other arm was run with these settings: {label}." for label in alone]
+    return "\n".join([*lines, ""])
 
 
 def main(arguments: list[str]) -> int:

@@ -100,7 +100,7 @@ def measure(agent: Agent, name: str, episode: Episode) -> dict[str, np.ndarray]:
         outlived: (at most H − 3,) chance that a dream outlives the end by 3, begun so far before.
         seen_image: (L,) squared error of a pixel of an image that is seen: its reconstruction.
         saturated: (L, A) whether an action is within 0.01 of its bound.
-        greedy, sigma: (L, A) the actor's mode in each state, and the explorer's σ.
+        greedy, sigma: (L, A) the actor's greedy action in each state, and the explorer's σ.
     """
     s, model, actor, rewards = agent.s, agent.model, agent.players[name], episode.rewards
     images, actions = (

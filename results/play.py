@@ -116,7 +116,7 @@ def show(command: argparse.Namespace) -> None:
     returns, lengths = np.array([(e.total, e.length) for e in episodes]).T
     spread = f" ± {train.interval95(returns):.1f} (95% interval)" if len(returns) > 1 else ""
     print(
-        f"{s.env}, arm {s.arm}, networks {name}, {command.actor} actor's mode: return "
+        f"{s.env}, arm {s.arm}, networks {name}, {command.actor} actor's greedy actions: return "
         f"{returns.mean():.1f}{spread}, {lengths.mean():.0f} environment steps an episode"
     )
     each = (f"{r:.1f} ({n:.0f})" for r, n in zip(returns, lengths, strict=True))
@@ -158,7 +158,7 @@ def exit_code(work: Callable[[], object]) -> int:
 def main(arguments: list[str]) -> int:
     """Runs a command line. Returns its `exit_code`."""
     parser = command_line("play.py", "Plays the networks of a run.", episodes=10)
-    add, which = parser.add_argument, "by its mode; evaluated: evaluations' own (%(default)s)"
+    add, which = parser.add_argument, "who plays; evaluated: who evaluations play (%(default)s)"
     add("--actor", choices=("evaluated", *ACTORS), default="evaluated", help=which)
     add("--video", action="store_true", help="the best episode's beginning as an animated GIF")
     return exit_code(lambda: show(parser.parse_args(arguments)))

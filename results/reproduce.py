@@ -9,6 +9,7 @@ made it in its made_with.json. The same command again skips finished runs and ta
 import argparse
 import contextlib
 import dataclasses
+import json
 import os
 import re
 import shlex
@@ -78,14 +79,16 @@ def runs(command: argparse.Namespace, options: list[str]) -> dict[Path, list[str
 
 
 def differing(folder: Path, options: list[str]) -> str:
-    """In which settings the run that a folder holds is not of these options: none, if none is."""
+    """In which settings the run that a folder holds is not of these options, of whichever version
+    it is: none, if there is none."""
     try:
-        made = dataclasses.asdict(train.read_settings(folder))
-    except (OSError, ValueError):  # none is there, or none that train.py would go on with
+        made = json.loads((folder / "settings.json").read_text())
+    except (OSError, ValueError):  # damaged, and train.py will say so
         return ""
     wanted = dataclasses.asdict(train.parse(options).settings)
-    fixed = made.keys() - {*train.CHANGEABLE}
-    return ", ".join(f"{name} {made[name]}" for name in sorted(fixed) if made[name] != wanted[name])
+    fixed = (made.keys() | wanted.keys()) - {*train.CHANGEABLE}
+    others = (name for name in sorted(fixed) if made.get(name) != wanted.get(name))
+    return ", ".join(f"{name} {made.get(name)}" for name in others)
 
 
 def steps_made(folder: Path, steps: int) -> int:

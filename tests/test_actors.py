@@ -79,7 +79,7 @@ def test_actions_are_the_tanh_of_a_normal():
 
 
 @pytest.mark.parametrize("kind", [StochasticActor, DeterministicActor])
-def test_actions_and_modes_stay_within_one(kind):
+def test_actions_and_greedy_ones_stay_within_one(kind):
     actor = kind(6, 2, 32)
     actor.net[-1].weight.data *= 1e4
     state = torch.randn(200, 6)
@@ -88,7 +88,7 @@ def test_actions_and_modes_stay_within_one(kind):
         assert action.abs().max() > 0.99
 
 
-def test_mode_is_the_tanh_of_the_mean_and_the_deterministic_action_is_the_same_function():
+def test_greedy_is_the_tanh_of_the_mean_and_the_deterministic_action_is_the_same_function():
     """tanh(5 tanh(x / 5)) at x = 1 and x = −4."""
     stochastic = always(StochasticActor(6, 2, 32), 1.0, -4.0, 0.0, 0.0)
     deterministic = always(DeterministicActor(6, 2, 32), 1.0, -4.0)

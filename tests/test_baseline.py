@@ -3,6 +3,7 @@ itself is not installed here; results/README.md says what was run with it."""
 
 import json
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,23 @@ def test_without_sb3_one_sentence_says_what_to_install(tmp_path, capsys, monkeyp
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
     assert baseline.main(["--from", "states", "--run-dir", str(tmp_path / "a")]) == 2
     assert capsys.readouterr().err.count("\n") == 1 and not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize("sees", ["states", "pixels"])
+def test_a_name_that_is_no_environment_leaves_one_sentence_and_no_folder(
+    sees, tmp_path, capsys, monkeypatch
+):
+    def make_all(makers):
+        return [make() for make in makers]
+
+    vector = SimpleNamespace(DummyVecEnv=make_all)
+    sb3 = SimpleNamespace(common=SimpleNamespace(vec_env=vector))
+    monkeypatch.setitem(sys.modules, "stable_baselines3", sb3)
+    arguments = ["--from", sees, "--env", "Hoper-v0", "--run-dir", str(tmp_path / "a")]
+    assert baseline.main(arguments) == 2
+    assert capsys.readouterr().err.count("\n") == 1 and not (tmp_path / "a").exists()
+    assert baseline.main([*arguments[:-1], str(tmp_path)]) == 2
+    assert "there already" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("arm", baseline.USUAL)

@@ -109,8 +109,8 @@ def test_runs_are_held_against_those_of_the_same_settings():
         arms["revised, batch_size 10"] = arms.pop("revised")
     assert claims.shared_changes(runs) == []
     said = claims.report(runs, plot.read_reference())
-    assert "no revised" in said and "no other arm has: revised, batch_size 10." in said
-    assert "no other arm has: dreamer" not in said
+    assert "no revised" in said and "with these settings: revised, batch_size 10." in said
+    assert "with these settings: dreamer" not in said and said.endswith(".\n")
     for arms in runs.values():
         arms["dreamer, batch_size 10"] = arms.pop("dreamer")
     assert claims.shared_changes(runs) == [{"batch_size 10"}]

@@ -40,6 +40,14 @@ def test_the_table_covers_every_labelled_equation_and_modification():
     assert "minor 3" in TABLE and "minor 4" in TABLE
 
 
+def test_the_table_of_results_is_of_the_last_fifths_that_plot_writes():
+    for line in (ROOT / "results" / "whole" / "table.md").read_text().splitlines():
+        env, _, seed, *rest = (cell.strip() for cell in line.strip("|").split("|"))
+        if seed.isdigit():
+            row = next(row for row in README.splitlines() if row.startswith(f"| {env[:-12]} |"))
+            assert f" {float(rest[4]):.0f} (seed {seed}" in row, line
+
+
 def test_the_table_of_speed_is_what_the_benchmark_printed():
     rows = (ROOT / "results" / "benchmark.md").read_text().splitlines()
     assert len(rows) == 20 and not [row for row in rows if row not in RESULTS]

@@ -412,6 +412,7 @@ def test_ends_are_learnt_in_dreams_too():
         model, batch = make_model(ends_ahead=ahead), make_batch()
         term = loss(model, batch)[0]["termination"]
         assert set(moves(term, model.prior_net.parameters())) == {ahead > 0}
+        assert not any(moves(loss(model, batch)[0]["reward"], model.prior_net.parameters()))
         constant_head(model.termination, 1.0)
         terms[ahead] = loss(model, batch)[0]["termination"]
     taught = torch.zeros(3, 6)
