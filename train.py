@@ -108,7 +108,7 @@ class Settings:
     batch_size: Size = 50  # sequences a batch (Dreamer: 50)
     length: Annotated[Size, Interval(ge=2)] = 50  # rows a sequence (Dreamer: 50)
     burn_in: Whole = 0  # rows of one begun mid-episode: no reward, end or dream is of them (ours)
-    heads_ahead: Whole = 0  # steps of dreams in which rewards and ends are learnt too (ours)
+    ends_ahead: Whole = 0  # steps of dreams in which ends are learnt too (ours)
     decode_share: Share = 1.0  # of a batch's images, those that are decoded (Dreamer: all)
     horizon: Size = 15  # imagined steps, and n of Eq. (10) (Dreamer)
     starts: Share = 1.0  # of a batch's live states, those that actors dream on from (Dreamer: all)
@@ -136,8 +136,7 @@ class Settings:
     free_nats: Amount = 3.0  # KL below this costs nothing; of `kl` only (Dreamer)
     image_weight: Amount = 1.0  # weight of the image's loss (Dreamer)
     reward_weight: Amount = 1.0  # of the reward's loss (Dreamer)
-    termination_weight: Amount = 10.0  # of the termination's loss (Dreamer), seen or dreamt
-    dreamt_reward_weight: Amount = 1.0  # of the reward's in the dreams of `heads_ahead` (ours)
+    termination_weight: Amount = 10.0  # of the termination's loss (Dreamer)
     kl_weight: Amount = 1.0  # of `kl`, the original Dreamer's divergence (Dreamer)
     kl_standard_weight: Amount = 0.1  # of KL(posterior || N(0, 1)) (§5)
     jeffreys_weight: Amount = 0.1  # of D_J(posterior || prior) (§5)
@@ -161,10 +160,10 @@ PRESETS = {
     "small": dict(  # sizes and cadence for two CPU cores, and what results/trials.md found to help
         deter=128, stoch=64, hidden=128, units=128, depth=16, batch_size=20, length=25,
         mdn_units=128, prefill=2000, starts=0.25, floor_brightness=0.4, reward_weight=20.0,
-        squared_reward=True, smooth_l1=False, termination_weight=100.0, heads_ahead=5, burn_in=2,
-        dreamt_reward_weight=4.0, action_penalty=0.01, critic_lr=5e-4, critic_norm=True,
-        actor_lr=2e-4, horizon=10, play_rate=0.01, decode_share=0.25, dream_noise=0.3,
-        collect="both", action_noise=0.3, random_action=0.01,
+        squared_reward=True, smooth_l1=False, termination_weight=100.0, ends_ahead=5, burn_in=2,
+        action_penalty=0.01, critic_lr=5e-4, critic_norm=True, actor_lr=2e-4, horizon=10,
+        play_rate=0.01, decode_share=0.25, dream_noise=0.3, collect="both", action_noise=0.3,
+        random_action=0.01,
     ),
     "paper": dict(steps=1_000_000, train_every=1000, updates=100),
 }
@@ -195,7 +194,6 @@ def update(
     weights = {
         "image": s.image_weight, "reward": s.reward_weight, "termination": s.termination_weight,
         "kl": s.kl_weight, "kl_standard": s.kl_standard_weight, "jeffreys": s.jeffreys_weight,
-        "dreamt_reward": s.dreamt_reward_weight, "dreamt_termination": s.termination_weight,
     }  # fmt: skip
     with agent.autocast():
         terms, states = agent.model.loss(batch)
@@ -400,7 +398,7 @@ class Agent(nn.Module):
             termination=s.termination, fixed_prior=s.fixed_prior,
             smooth_l1=s.smooth_l1 and not s.squared_reward,
             decode_stoch_only=s.decode_stoch_only, decode_share=s.decode_share,
-            burn_in=s.burn_in, heads_ahead=s.heads_ahead, observe_first=s.observe_first,
+            burn_in=s.burn_in, ends_ahead=s.ends_ahead, observe_first=s.observe_first,
             free_nats=s.free_nats,
         )  # fmt: skip
         size = self.model.size

@@ -203,9 +203,9 @@ class WorldModel(nn.Module):
         decode_share: of a batch's images, those that are decoded, drawn at random (ours).
         burn_in: first rows of a sequence that begins within an episode, whose h does not hold what
             came before: they teach no reward and no end (ours; the idea is R2D2's).
-        heads_ahead: steps of dreams along recorded actions in which rewards and ends are learnt
-            too, since that is where actors use them; their gradient passes through the prior into
-            all that came before (ours; 0: in what was seen alone).
+        ends_ahead: steps of dreams along recorded actions in which ends are learnt too, since that
+            is where actors use them; the gradient passes through the prior into all that came
+            before (ours; 0: in what was seen alone).
         observe_first: z_0 is inferred from o_0, so a_0 depends on it (§4.2). Without it s_0 is
             zero and o_0 is never seen.
         free_nats: KL below which there is nothing to gain (Dreamer); with `fixed_prior` unused.
@@ -214,13 +214,13 @@ class WorldModel(nn.Module):
     def __init__(
         self, actions: int, *, deter: int, stoch: int, hidden: int, units: int, depth: int,
         termination: bool, fixed_prior: bool, smooth_l1: bool, decode_stoch_only: bool,
-        decode_share: float, burn_in: int, heads_ahead: int, observe_first: bool, free_nats: float,
+        decode_share: float, burn_in: int, ends_ahead: int, observe_first: bool, free_nats: float,
     ):  # fmt: skip
         super().__init__()
         self.deter, self.stoch, self.size = deter, stoch, deter + stoch
         self.fixed_prior, self.smooth_l1, self.free_nats = fixed_prior, smooth_l1, free_nats
         self.decode_stoch_only, self.observe_first = decode_stoch_only, observe_first
-        self.decode_share, self.burn_in, self.heads_ahead = decode_share, burn_in, heads_ahead
+        self.decode_share, self.burn_in, self.ends_ahead = decode_share, burn_in, ends_ahead
         self.encoder = Encoder(depth)
         # One dense layer on (z, a), in two parts: the action's needs no recurrence.
         self.dense_stoch = nn.Linear(stoch, hidden, bias=False)
@@ -334,8 +334,8 @@ class WorldModel(nn.Module):
 
             image        ½ Σ (o − o')² over pixels; of `decode_share` of the images
             reward       Smooth L1, or ½ (r − r')²; of settled rows; first ones have none
-            termination  binary cross-entropy on `terminated`, never on `truncated`; likewise
-            dreamt_…     these two in dreams along the recorded actions (`heads_ahead`)
+            termination  binary cross-entropy on `terminated`, never on `truncated`; likewise;
+                         with `ends_ahead`, plus its mean in dreams along the recorded actions
             kl_standard  KL(posterior ‖ N(0, 1)), which gives the prior no gradient (§4.2)
             jeffreys     KL(posterior ‖ prior) + KL(prior ‖ posterior) (§4.2)
             kl           max(KL(posterior ‖ prior), free nats), Dreamer's, for the last two
@@ -358,34 +358,32 @@ class WorldModel(nn.Module):
         shown, pixels = self.decoded(observed.state).flatten(0, 1), batch["image"].flatten(0, 1)
         image = self.decoder.nll(shown[some], pixels[some])
         terms = {"image": masked_mean(image, seen.flatten()[some])}
-        terms |= self.head_losses(observed.state, batch, taught)
-        if self.heads_ahead:
-            dreamt = self.losses_ahead(observed.state, batch)
-            terms |= {f"dreamt_{name}": term for name, term in dreamt.items()}
+        reward = self.predict_reward(observed.state)
+        error = regression_error(reward, batch["reward"], self.smooth_l1)
+        terms["reward"] = masked_mean(error, taught)
+        if self.termination is not None:
+            terms["termination"] = self.end_loss(observed.state, batch["terminated"], taught)
+            if self.ends_ahead:
+                ahead = self.end_loss_ahead(observed.state, batch)
+                terms["termination"] = terms["termination"] + ahead
         return terms | self.divergences(observed.posterior, observed.prior, seen), observed.state
 
-    def head_losses(
-        self, state: Tensor, batch: dict[str, Tensor], taught: Tensor
-    ) -> dict[str, Tensor]:
-        """The terms reward and termination of `loss` in states (…, D), of rows where `taught` (…)
-        is 1."""
-        loss = regression_error(self.predict_reward(state), batch["reward"], self.smooth_l1)
-        terms = {"reward": masked_mean(loss, taught)}
-        if self.termination is not None:
-            logit, terminated = self.termination(state).squeeze(-1), batch["terminated"]
-            loss = F.binary_cross_entropy_with_logits(logit, terminated.float(), reduction="none")
-            terms["termination"] = masked_mean(loss, taught)
-        return terms
+    def end_loss(self, state: Tensor, terminated: Tensor, taught: Tensor) -> Tensor:
+        """The term termination of `loss` in states (…, D), of rows where `taught` (…) is 1."""
+        logit = self.termination(state).squeeze(-1)
+        loss = F.binary_cross_entropy_with_logits(logit, terminated.float(), reduction="none")
+        return masked_mean(loss, taught)
 
-    def losses_ahead(self, state: Tensor, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """The terms reward and termination of `loss` in dreams along the recorded actions.
+    def end_loss_ahead(self, state: Tensor, batch: dict[str, Tensor]) -> Tensor:
+        """The term termination of `loss` in dreams along the recorded actions.
 
-        They take `heads_ahead` steps each, fewer in a shorter sequence, one after the other, up to
+        They take `ends_ahead` steps each, fewer in a shorter sequence, one after the other, up to
         the last row. One from an unsettled state teaches nothing, nor does any beyond its episode.
-        Gradients pass into the states (B, T, D) that they start from.
+        Gradients pass into the states (B, T, D) that they start from. Where rewards were learnt
+        there too, HalfCheetah learnt later (one seed; results/trials.md, section N).
         """
         length = state.shape[1]
-        steps = min(self.heads_ahead, length - 1)
+        steps = min(self.ends_ahead, length - 1)
         first = (length - 1) % steps
         starts = slice(first, -1, steps)
 
@@ -395,10 +393,9 @@ class WorldModel(nn.Module):
             return rows.unflatten(1, (-1, steps)).flatten(0, 1).transpose(0, 1)
 
         dreamt = self.along(state[:, starts].flatten(0, 1), recorded("action"))[1:]
-        came = {name: recorded(name) for name in ("reward", "terminated", "is_first")}
         taught = self.settled(batch["is_first"])[:, starts].flatten()
-        taught = taught * (~came["is_first"]).cumprod(0)
-        return self.head_losses(dreamt, came, taught)
+        taught = taught * (~recorded("is_first")).cumprod(0)
+        return self.end_loss(dreamt, recorded("terminated"), taught)
 
     def divergences(self, posterior: Normal, prior: Normal, seen: Tensor) -> dict[str, Tensor]:
         """The terms of `loss` that hold the posterior to the prior, in nats, summed over z."""

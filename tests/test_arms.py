@@ -65,8 +65,8 @@ LEARNING = {
     "critic_lr": (5e-4, 8e-5),
     "critic_norm": (True, False), "actor_lr": (2e-4, 8e-5), "horizon": (10, 15),
     "play_rate": (0.01, 1.0), "termination_weight": (100.0, 10.0), "decode_share": (0.25, 1.0),
-    "dream_noise": (0.3, 0.0), "collect": ("both", "explorer"), "heads_ahead": (5, 0),
-    "burn_in": (2, 0), "dreamt_reward_weight": (4.0, 1.0),
+    "dream_noise": (0.3, 0.0), "collect": ("both", "explorer"), "ends_ahead": (5, 0),
+    "burn_in": (2, 0),
 }  # fmt: skip
 ACTIONS = 2
 
@@ -366,18 +366,14 @@ def test_losses_are_the_weighted_sums_of_their_named_terms(arm):
         losses[name] = loss.item()
         step()
 
-    some = dict(kl_weight=1.5, reward_weight=2.0, heads_ahead=2, dreamt_reward_weight=3.0)
-    metrics = watched_update(tiny(arm, **some), watch)
+    metrics = watched_update(tiny(arm, kl_weight=1.5, reward_weight=2.0), watch)
     terms = {k.removeprefix("model/"): v for k, v in metrics.items() if k.startswith("model/")}
     del terms["grad_norm"]
     revised = arm in ("revised", "maxent")
-    names = {"image", "reward", "dreamt_reward"} | (
-        {"termination", "dreamt_termination", "kl_standard", "jeffreys"} if revised else {"kl"}
+    names = {"image", "reward"} | (
+        {"termination", "kl_standard", "jeffreys"} if revised else {"kl"}
     )
-    weights = {
-        "kl_standard": 0.1, "jeffreys": 0.1, "kl": 1.5, "reward": 2.0, "termination": 10,
-        "dreamt_reward": 3.0, "dreamt_termination": 10,
-    }  # fmt: skip
+    weights = {"kl_standard": 0.1, "jeffreys": 0.1, "kl": 1.5, "reward": 2.0, "termination": 10}
     assert terms.keys() == names
     total = sum(weights.get(name, 1) * term for name, term in terms.items())
     assert losses["model"] == pytest.approx(total, rel=1e-6)
@@ -412,13 +408,11 @@ def test_beta_moves_the_stochastic_actor_and_not_the_deterministic_one():
         assert changed(snapshot(one), snapshot(other)) == {"stochastic_actor", "stochastic_player"}
 
 
-def test_heads_ahead_reach_the_model():
-    (_, alone), (agent, both) = (updated(tiny("maxent", heads_ahead=n)) for n in (0, 2))
-    assert agent.model.heads_ahead == 2
-    for name in ("reward", "termination"):  # two untrained guesses are alike
-        assert both[f"model/dreamt_{name}"] > 0.5 * both[f"model/{name}"]
-        assert both[f"model/{name}"] == alone[f"model/{name}"]
-        assert f"model/dreamt_{name}" not in alone
+def test_ends_ahead_reach_the_model():
+    (_, alone), (agent, both) = (updated(tiny("maxent", ends_ahead=n)) for n in (0, 2))
+    assert agent.model.ends_ahead == 2
+    assert both["model/termination"] > 1.5 * alone["model/termination"]  # of two guesses alike
+    assert both["model/reward"] == alone["model/reward"]
 
 
 def test_terminal_states_start_no_dream():

@@ -54,7 +54,7 @@ def test_a_checkpoint_brings_back_random_numbers_and_optimisers(tmp_path):
 @pytest.mark.parametrize("density", ["mdn", "knn"])
 def test_an_update_waits_for_the_device_at_its_start_and_at_its_end_alone(density):
     switches = dict(
-        starts=0.5, decode_share=0.5, dream_noise=0.3, critic_norm=True, heads_ahead=5,
+        starts=0.5, decode_share=0.5, dream_noise=0.3, critic_norm=True, ends_ahead=5,
         burn_in=2, action_penalty=0.01, smooth_l1=False,
     )  # fmt: skip
     s = tiny("maxent", density=density, **switches)

@@ -100,7 +100,7 @@ CASES = (
         "blind": tiny("maxent", observe_first=False, **STILL),
         "half the images": tiny("maxent", decode_share=0.5, **STILL),
         "penalty": tiny("maxent", action_penalty=0.01, **STILL),
-        "heads ahead": tiny("maxent", heads_ahead=2, burn_in=1, **STILL),
+        "ends ahead": tiny("maxent", ends_ahead=2, burn_in=1, **STILL),
     }
 )
 MARGINS = {"below all, above one": 0.5, "above all, below one": 1.5}

@@ -139,11 +139,11 @@ def test_a_run_of_other_settings_is_not_taken_for_the_one_asked_for(stand_in, ca
         reproduce.main([*arguments, "--", "--horizon", "7"])
     said = capsys.readouterr().err.splitlines()[-1]
     assert end.value.code == 2 and "a run with horizon 10: name another --out." in said
-    older = asked.settings.to_json().replace('"heads_ahead"', '"ends_ahead"')
+    older = asked.settings.to_json().replace('"ends_ahead"', '"heads_ahead"')
     (folder / "settings.json").write_text(older)
     with pytest.raises(SystemExit):
         reproduce.main(arguments)
-    assert "a run with ends_ahead 5, heads_ahead None:" in capsys.readouterr().err
+    assert "a run with ends_ahead None, heads_ahead 5:" in capsys.readouterr().err
 
 
 # ---- what becomes of each ------------------------------------------------------------------------

@@ -21,7 +21,7 @@ def make_model(**changes) -> WorldModel:
     sizes = dict(deter=DETER, stoch=STOCH, hidden=8, units=8, depth=2)
     switches = dict(
         termination=True, fixed_prior=True, smooth_l1=True, decode_stoch_only=True,
-        decode_share=1.0, burn_in=0, heads_ahead=0, observe_first=True, free_nats=0.0,
+        decode_share=1.0, burn_in=0, ends_ahead=0, observe_first=True, free_nats=0.0,
     )  # fmt: skip
     return WorldModel(ACTIONS, **(sizes | switches | changes))
 
@@ -404,37 +404,39 @@ def test_rows_of_which_too_little_was_seen_teach_no_reward_and_no_end():
             assert same != counts
 
 
-@pytest.mark.parametrize("name", ["reward", "termination"])
-def test_heads_ahead_learn_what_dreams_meet_too(name):
+def test_ends_are_learnt_in_dreams_too():
     """Of six rows dreams of two steps meet the last four, but of no other episode: the second
     sequence's begins at its row 3. The loss then moves the prior."""
-    model, batch = make_model(heads_ahead=2), make_batch()
-    terms, _ = loss(model, batch)
-    assert not any(moves(terms[name], model.prior_net.parameters()))
-    assert all(moves(terms[f"dreamt_{name}"], model.prior_net.parameters()))
-    constant_head(getattr(model, name), 1.0)
+    terms = {}
+    for ahead in (0, 2):
+        model, batch = make_model(ends_ahead=ahead), make_batch()
+        term = loss(model, batch)[0]["termination"]
+        assert set(moves(term, model.prior_net.parameters())) == {ahead > 0}
+        assert not any(moves(loss(model, batch)[0]["reward"], model.prior_net.parameters()))
+        constant_head(model.termination, 1.0)
+        terms[ahead] = loss(model, batch)[0]["termination"]
     taught = torch.zeros(3, 6)
     taught[:, 2:] = 1
     taught[1, 3] = 0
-    met = model.head_losses(torch.zeros(3, 6, model.size), batch, taught)[name]
-    assert loss(model, batch)[0][f"dreamt_{name}"].item() == pytest.approx(met.item())
+    met = model.end_loss(torch.zeros(3, 6, model.size), batch["terminated"], taught)
+    assert terms[2].item() == pytest.approx((terms[0] + met).item())
 
 
 @pytest.fixture
 def taught(monkeypatch):
-    """What a model's `head_losses` was given: states, rows, and which of them count."""
-    given, head_losses = [], WorldModel.head_losses
-    noting = lambda model, *a: given.append(a) or head_losses(model, *a)  # noqa: E731
-    monkeypatch.setattr(WorldModel, "head_losses", noting)
+    """What a model's `end_loss` was given: states, ends, and which of them count."""
+    given, end_loss = [], WorldModel.end_loss
+    noting = lambda model, *a: given.append(a) or end_loss(model, *a)  # noqa: E731
+    monkeypatch.setattr(WorldModel, "end_loss", noting)
     return given
 
 
 @pytest.mark.parametrize("ahead, starts", [(1, (0, 1, 2, 3, 4)), (2, (1, 3)), (9, (0,))])
-def test_heads_ahead_dream_along_the_actions_that_were_taken(ahead, starts, taught):
-    model, batch = make_model(heads_ahead=ahead), make_batch()
+def test_dreams_of_ends_take_the_actions_that_were_taken(ahead, starts, taught):
+    model, batch = make_model(ends_ahead=ahead), make_batch()
     _, states = loss(model, batch)
     of_start = (3, len(starts))
-    dream, came = taught[1][0].unflatten(1, of_start), taught[1][1]
+    dream, terminated = (x.unflatten(1, of_start) for x in taught[1][:2])
     assert len(dream) == min(ahead, 5)
     for n, start in enumerate(starts):
         state = states[:, start]
@@ -444,8 +446,7 @@ def test_heads_ahead_dream_along_the_actions_that_were_taken(ahead, starts, taug
                 *state.split([DETER, STOCH], -1), model.dense_action(batch["action"][:, row])
             )
             torch.testing.assert_close(arrived[:, :DETER], h)
-            for name in came:
-                assert torch.equal(came[name].unflatten(1, of_start)[k, :, n], batch[name][:, row])
+            assert torch.equal(terminated[k, :, n], batch["terminated"][:, row])
             state = arrived
 
 
@@ -453,21 +454,17 @@ def test_heads_ahead_dream_along_the_actions_that_were_taken(ahead, starts, taug
     (5, [[[1, 1, 1, 1, 1]], [[1, 1, 0, 0, 0]], [[0, 0, 0, 0, 0]]]),  # from row 0
     (2, [[[1, 1], [1, 1]], [[1, 0], [1, 1]], [[0, 0], [1, 1]]]),  # from rows 1 and 3
 ])  # fmt: skip
-def test_dreams_along_recorded_actions_end_with_their_episode_and_begin_where_enough_was_seen(
-    ahead, rows, taught
-):
-    model, batch = make_model(burn_in=2, heads_ahead=ahead), make_batch()
+def test_dreams_of_ends_end_with_their_episode_and_begin_where_enough_was_seen(ahead, rows, taught):
+    model, batch = make_model(burn_in=2, ends_ahead=ahead), make_batch()
     batch["is_first"][2, 0] = False  # it begins within an episode, as the others do not
     loss(model, batch)
     assert taught[1][2].T.unflatten(0, (3, -1)).tolist() == rows
 
 
-def test_dreams_along_recorded_actions_teach_the_states_that_they_start_from():
-    model, batch = make_model(heads_ahead=2), make_batch()
+def test_dreams_of_ends_teach_the_states_that_they_start_from():
+    model, batch = make_model(ends_ahead=2), make_batch()
     _, states = loss(model, batch)
-    ahead = model.losses_ahead(states, batch)
-    for term in ahead.values():
-        assert all(moves(term, model.encoder.parameters()))
+    assert all(moves(model.end_loss_ahead(states, batch), model.encoder.parameters()))
 
 
 def test_continues_is_one_minus_the_probability_of_the_end():
