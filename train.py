@@ -697,8 +697,7 @@ class Run:
         there is none, the replay is not its own, or what may not change differs."""
         path, saved = read_checkpoint(self.own)
         made, now, here = json.loads(saved["settings"]), dataclasses.asdict(self.s), self.machine
-        changed = [name for name in now if now[name] != made.get(name)]
-        if fixed := [f"{name} {made.get(name)}" for name in changed if name not in CHANGEABLE]:
+        if fixed := fixed_changes(made, now):
             raise ValueError(f"{self.folder} keeps its own {', '.join(fixed)}; --resume takes "
                              f"{', '.join(CHANGEABLE)}.")  # fmt: skip
         vars(self).update(saved["kept"])
@@ -721,9 +720,10 @@ class Run:
         torch.set_rng_state(saved["torch_random"])
         if self.agent.device.type == "cuda":
             torch.cuda.set_rng_state_all(saved["cuda_random"])
-        for name in changed:
+        for name in CHANGEABLE:
             since = f"{name}: {now[name]} instead of {made[name]} from step {self.step:,} on"
-            say(since + ("; β now falls to its end by then." if name == "steps" else "."))
+            if now[name] != made[name]:
+                say(since + ("; β now falls to its end by then." if name == "steps" else "."))
 
     def retrace(self) -> None:
         """Take the actions of the episode under way again: its environment is then where it was."""
@@ -743,6 +743,12 @@ CHANGEABLE = (
     "steps", "eval_every", "eval_episodes", "eval_max_steps", "checkpoint_minutes", "model_lr",
     "actor_lr", "critic_lr", "mdn_lr", "grad_clip",
 )  # fmt: skip
+
+
+def fixed_changes(made: dict[str, object], now: dict[str, object]) -> list[str]:
+    """Of the settings that a run was made with, those that are others now, and may not be."""
+    changed = (name for name in now if now[name] != made.get(name))
+    return [f"{name} {made.get(name)}" for name in changed if name not in CHANGEABLE]
 
 
 def write_whole(path: Path, content: object, keep: Path | None = None) -> None:

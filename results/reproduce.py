@@ -86,9 +86,8 @@ def differing(folder: Path, options: list[str]) -> str:
     except (OSError, ValueError):  # damaged, and train.py will say so
         return ""
     wanted = dataclasses.asdict(train.parse(options).settings)
-    fixed = (made.keys() | wanted.keys()) - {*train.CHANGEABLE}
-    others = (name for name in sorted(fixed) if made.get(name) != wanted.get(name))
-    return ", ".join(f"{name} {made.get(name)}" for name in others)
+    unknown = dict.fromkeys(made.keys() - wanted.keys())  # another version's
+    return ", ".join(train.fixed_changes(made, wanted | unknown))
 
 
 def steps_made(folder: Path, steps: int) -> int:
