@@ -354,8 +354,9 @@ def passed(before: int, after: int, every: int) -> int:
 
 
 def to_tensors(rows: np.ndarray, device: torch.device) -> dict[str, Tensor]:
-    """Records of the replay as one tensor a field."""
-    return {name: torch.from_numpy(rows[name]).to(device) for name in rows.dtype.names}
+    """Records of the replay as one tensor a field, in memory of torch's own: some kernels round
+    otherwise where memory is aligned otherwise."""
+    return {name: torch.tensor(rows[name], device=device) for name in rows.dtype.names}
 
 
 def beta_at(step: int, s: Settings) -> float:
@@ -728,10 +729,10 @@ class Run:
     def retrace(self) -> None:
         """Take the actions of the episode under way again: its environment is then where it was."""
         with contextlib.suppress(EnvironmentFault):
-            image = self.reset()
+            image, reward, last = self.reset(), 0.0, self.replay.last
             for action in self.actions:
-                image = self.env.step(np.float32(action))[0]
-            if np.array_equal(image, self.replay.last["image"]):
+                image, reward, *_ = self.env.step(np.float32(action))
+            if np.array_equal(image, last["image"]) and np.float32(reward) == last["reward"]:
                 return
         self.over = True
         say(f"{self.s.env} does not repeat itself: the episode under way ends here, and the run "

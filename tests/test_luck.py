@@ -308,6 +308,43 @@ def test_an_environment_that_fails_in_an_evaluation_stops_nothing(register, tmp_
     assert (folder / "weights.pt").exists()
 
 
+class Repeats(Second):
+    """Its episodes of 50 steps are the same in each process."""
+
+    image, reward = 0, 1.0  # what is not the same in another one
+
+    def step(self, action):
+        obs, _, _, truncated, info = super().step(action)
+        reward = 1.0 if self.number <= 2 else self.reward
+        return obs, reward, self.t >= 50, truncated, info
+
+    def render(self):
+        return super().render() | np.uint8(0 if self.number <= 2 else self.image)
+
+
+class OtherReward(Repeats):
+    reward = 1.0 + 1e-6
+
+
+class OtherImage(Repeats):
+    image = 1
+
+
+@pytest.mark.parametrize(
+    "environment, said", [(Repeats, False), (OtherReward, True), (OtherImage, True)]
+)
+def test_an_environment_that_does_not_repeat_itself_ends_the_episode_under_way(
+    environment, said, register, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(environment, "made", 0)
+    folder, name = tmp_path / "run", register(environment)
+    assert train.main(["--env", name, "--run-dir", str(folder), *FAST]) == 0  # 120: amid the third
+    capsys.readouterr()
+    assert train.main(["--resume", str(folder), "--steps", "180"]) == 0
+    assert ("does not repeat itself" in capsys.readouterr().err) == said
+    assert train.read_checkpoint(folder)[1]["kept"]["episode"] == 4 + said
+
+
 def test_an_action_that_is_not_finite_is_not_the_environments_fault(
     register, tmp_path, monkeypatch, capfd
 ):
