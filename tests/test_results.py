@@ -553,7 +553,7 @@ def test_committed_runs_are_of_this_programs_settings():
 
 def test_committed_runs_of_the_old_view_are_whole():
     paths = list(RESULTS.glob("old_view/**/settings.json"))
-    assert len(paths) == 21
+    assert len(paths) == 23
     for path in paths:
         last = path.with_name("metrics.csv").read_text().splitlines()[-1]
         assert int(last.split(",")[0]) >= json.loads(path.read_text())["steps"], path
