@@ -160,8 +160,8 @@ def act(
         the action (A,) and the state (1, D). A FloatingPointError if the action is not finite, lest
         the environment be blamed for it.
     """
-    rows = np.array(image), np.array(action), np.array(state is None)  # B = T = 1
-    rows = [torch.from_numpy(x)[None, None].to(agent.device) for x in rows]
+    rows = image, action, state is None  # B = T = 1
+    rows = [torch.tensor(x, device=agent.device)[None, None] for x in rows]
     # No autocast: to cast all weights costs more than bfloat16 saves on one image.
     state = agent.model.observe(*rows, previous=state).state[:, 0]
     action = policy(state)[0].cpu().numpy()

@@ -354,8 +354,8 @@ def passed(before: int, after: int, every: int) -> int:
 
 
 def to_tensors(rows: np.ndarray, device: torch.device) -> dict[str, Tensor]:
-    """Records of the replay as one tensor a field, in memory of torch's own: some kernels round
-    otherwise where memory is aligned otherwise."""
+    """Records of the replay as one tensor a field, in memory of torch's own: Intel's MKL, for
+    one, may round otherwise where arrays are aligned otherwise, and a resumed run's would be."""
     return {name: torch.tensor(rows[name], device=device) for name in rows.dtype.names}
 
 
@@ -722,8 +722,8 @@ class Run:
         if self.agent.device.type == "cuda":
             torch.cuda.set_rng_state_all(saved["cuda_random"])
         for name in CHANGEABLE:
-            since = f"{name}: {now[name]} instead of {made[name]} from step {self.step:,} on"
             if now[name] != made[name]:
+                since = f"{name}: {now[name]} instead of {made[name]} from step {self.step:,} on"
                 say(since + ("; β now falls to its end by then." if name == "steps" else "."))
 
     def retrace(self) -> None:

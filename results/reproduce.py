@@ -86,8 +86,8 @@ def differing(folder: Path, options: list[str]) -> str:
     except (OSError, ValueError):  # damaged, and train.py will say so
         return ""
     wanted = dataclasses.asdict(train.parse(options).settings)
-    unknown = dict.fromkeys(made.keys() - wanted.keys())  # another version's
-    return ", ".join(train.fixed_changes(made, wanted | unknown))
+    now = dict.fromkeys(made) | wanted  # None: a setting of another version's
+    return ", ".join(sorted(train.fixed_changes(made, now)))
 
 
 def steps_made(folder: Path, steps: int) -> int:
