@@ -352,5 +352,5 @@ class Replay:
             raise ValueError(f"The replay holds {len(self)} rows, fewer than a window of {length}.")
         first = self.added - len(self) + rng.integers(len(self) - length + 1, size=batch)
         wanted = first[:, None] + np.arange(length)
-        rows = bytearray().join(map(self.read, wanted.flat))  # torch wants what it may write to
+        rows = b"".join(map(self.read, wanted.flat))
         return np.frombuffer(rows, self.dtype).reshape(wanted.shape)

@@ -152,11 +152,6 @@ def watched_update(s: Settings, watch, bfloat16=False) -> dict[str, float]:
 # --- settings ---
 
 
-def test_batches_are_in_memory_of_torchs_own_alignment():
-    for tensor in make_batch(tiny("maxent")).values():
-        assert tensor.is_contiguous() and tensor.data_ptr() % 64 == 0
-
-
 def test_arms_differ_as_in_the_table_and_in_nothing_else():
     arms = {name: dataclasses.asdict(default_settings(name, "paper")) for name in NAMES}
     assert tuple(ARMS) == NAMES
@@ -244,6 +239,11 @@ def test_interval_is_students():
 
 
 # --- one update ---
+
+
+def test_batches_are_in_memory_of_torchs_own_alignment():
+    for tensor in make_batch(tiny("maxent")).values():
+        assert tensor.is_contiguous() and tensor.data_ptr() % 64 == 0
 
 
 @pytest.mark.parametrize("bfloat16", [False, True])

@@ -311,11 +311,11 @@ def test_an_environment_that_fails_in_an_evaluation_stops_nothing(register, tmp_
 class Repeats(Second):
     """Its episodes of 50 steps are the same in each process."""
 
-    image, reward = 0, 1.0  # what is not the same in another one
+    image, reward = 0, 0.1  # what is not the same in another one
 
     def step(self, action):
         obs, _, _, truncated, info = super().step(action)
-        reward = 1.0 if self.number <= 2 else self.reward
+        reward = 0.1 if self.number <= 2 else self.reward
         return obs, reward, self.t >= 50, truncated, info
 
     def render(self):
@@ -323,7 +323,7 @@ class Repeats(Second):
 
 
 class OtherReward(Repeats):
-    reward = 1.0 + 1e-6
+    reward = 0.1 + 1e-6
 
 
 class OtherImage(Repeats):
