@@ -23,10 +23,13 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from actors import Episode, imagined_returns, play
 from results.play import command_line, exit_code, load, open_loop, strip
 from results.plot import read_metrics
+from returns import survival
 from train import Agent, Patient
 
 LATE = 3  # decisions that a dream may be late with an end
 OPEN_LOOP = 15  # steps that the model is followed without images
+SOON = 5  # of these, those told apart from what comes later
+MOMENTS = 4  # of an episode, from which dreams are taken at their word
 
 # Names of the figures that the verdict looks at.
 DEVIATION = "deviation of the greedy action over states (near 0: frozen)"
@@ -41,6 +44,8 @@ OUTLIVED = f"chance that dreams outlive an end that came by {LATE} decisions"
 PROMISED = "discounted return that the model promised"
 EARNED = "discounted return that then happened"
 AFTER = f"rewards, R² after {OPEN_LOOP} steps without images"
+OWN = f"reward of decisions {SOON + 1} to {OPEN_LOOP} of its own dreams, sum"
+TAKEN = "what the later ones' actions earned when they were taken"
 
 
 def r_squared(predicted: np.ndarray, real: np.ndarray) -> float:
@@ -76,17 +81,19 @@ def watch_alive(env) -> list[float]:
 
 def play_all(agent: Agent, env, name: str, alive: list[float], count: int):
     """Episodes of an actor, and what `measure` says of them together; also alive: (M,) that part
-    of each decision's reward, if `watch_alive` tells it."""
+    of each decision's reward, if `watch_alive` tells it, and own: what `take_at_its_word` says."""
     s, episodes, found = agent.s, [], defaultdict(list)
     for k in range(count):
         alive.clear()
-        episode = play(agent, env, agent.players[name], 2**31 - 1 - k, s.eval_max_steps)
+        seed = 2**31 - 1 - k
+        episode = play(agent, env, agent.players[name], seed, s.eval_max_steps)
         episodes.append(episode)
         for key, value in measure(agent, name, episode).items():
             found[key].append(value)
         if alive:  # the last decision may have fewer physics steps than the others
             first_steps = np.arange(0, len(alive), s.action_repeat)
             found["alive"].append(np.add.reduceat(alive, first_steps))
+        found["own"].append(take_at_its_word(agent, env, name, episode, seed))
     return episodes, {key: np.concatenate(values) for key, values in found.items()}
 
 
@@ -157,6 +164,35 @@ def follow(model, states: Tensor, images: Tensor, actions: Tensor, rewards: Tens
     }
 
 
+@torch.no_grad()
+def take_at_its_word(agent: Agent, env, name: str, episode: Episode, seed: int) -> np.ndarray:
+    """Dreams of an actor's own actions from some moments of its episode, beside the environment,
+    in which the episode is repeated up to there and then these actions are taken, whatever is met.
+
+    Returns:
+        (M, H, 2) dreamt and real reward of 1 … H decisions: dreamt, weighted by survival until
+        then; real, 0 after an end. M is 0 if the environment does not repeat itself.
+    """
+    length, rewards = len(episode.rewards), []
+    last = length - 1 if episode.terminated else max(0, length - OPEN_LOOP)
+    moments = np.unique(np.linspace(0, last, MOMENTS).astype(int))
+    dream = agent.model.imagine(episode.states[moments], agent.players[name].greedy, OPEN_LOOP)
+    own = dream.action.transpose(0, 1).cpu().numpy()
+    for moment, actions in zip(moments, own, strict=True):
+        env.reset(seed=seed)
+        before = [env.step(action)[1] for action in episode.actions[:moment]]
+        if not np.array_equal(before, episode.rewards[:moment]):
+            return np.zeros((0, OPEN_LOOP, 2))
+        came, over = [], False
+        while len(came) < OPEN_LOOP and not over:
+            _, reward, terminated, truncated, _ = env.step(actions[len(came)])
+            came.append(reward)
+            over = terminated or truncated
+        rewards.append(came + [0.0] * (OPEN_LOOP - len(came)))
+    dreamt = (survival(dream.continues) * dream.reward).T.cpu().numpy()
+    return np.stack([dreamt, np.array(rewards)], -1)
+
+
 def figures(found: dict[str, np.ndarray], episodes: list[Episode]) -> dict[str, float]:
     """The named figures of one actor, of all its episodes together."""
     reward, ended, returns = (found[key].T for key in ("reward", "terminated", "return"))
@@ -189,6 +225,11 @@ def figures(found: dict[str, np.ndarray], episodes: list[Episode]) -> dict[str, 
             named[AFTER if k == OPEN_LOOP else f"rewards, R² after {k} step without images"] = r2
             named[f"image error after {k} steps, grey levels of 255"] = error
             named[f"the same, of the last image seen for {k} steps"] = still
+    if "own" in found and len(found["own"]):
+        soon, later = (part.sum(1).mean(0) for part in np.split(found["own"], [SOON], axis=1))
+        named[f"reward of the first {SOON} decisions of its own dreams, sum"] = soon[0]
+        named["what their actions earned when they were taken"] = soon[1]
+        named |= {OWN: later[0], TAKEN: later[1]}
     return named
 
 
@@ -255,6 +296,12 @@ def draw(path: Path, agent: Agent, played, found, metrics) -> None:
     figure.savefig(path, dpi=100)
 
 
+def exceeds(of: dict[str, float], promised: str, earned: str) -> bool:
+    """Whether one figure is more than half as much again as the other, and by more than 1, which is
+    for those about 0; a critic that lags is off by less."""
+    return of.get(promised, 0) - of.get(earned, 0) > 0.5 * abs(of.get(earned, 0)) + 1
+
+
 # What to look at first, in this order: the first whose condition holds of an actor.
 VERDICTS = (
     # Of a range of 2. First, since rewards hardly vary where actions do not.
@@ -272,9 +319,11 @@ VERDICTS = (
     # At 0.005 a decision, dreams lose half as much again of what is far off as by γ = 0.99.
     (lambda of: of[EXPECTED] > 2 * of[ENDS] + 0.005 * of[DECISIONS],
      "the model expects ends that do not come: nothing far off counts in its dreams."),
-    # Half as much again is more than a critic that lags is off; 1 for returns about 0.
-    (lambda of: of.get(PROMISED, 0) - of.get(EARNED, 0) > 0.5 * abs(of.get(EARNED, 0)) + 1,
-     "more is promised than earned: the actor exploits the model's errors, or the critic lags."),
+    # Of what is promised too much: are the dreams wrong, or what the critic makes of them?
+    (lambda of: exceeds(of, PROMISED, EARNED) and exceeds(of, OWN, TAKEN),
+     "dreams earn what their actions do not: the actor exploits the model's errors."),
+    (lambda of: exceeds(of, PROMISED, EARNED),
+     "more is promised than earned: the critic lags, or believes too much of its dreams."),
     # Chance alone takes some of it in 15 steps.
     (lambda of: of.get(AFTER, 1) < of[REWARDS] - 0.6,
      "rewards are known where the image is seen and not in dreams: the dynamics are weak."),

@@ -106,6 +106,53 @@ def test_open_loop_follows_the_actions_taken():
     np.testing.assert_array_equal(opened[:, 1], episode.actions[5:20])
 
 
+class Counts:
+    """Pays 100 times the step's number and the action, to its 20th step; at each reset more, if it
+    does not repeat itself."""
+
+    def __init__(self, luck=0.0):
+        self.luck, self.resets = luck, 0
+
+    def reset(self, seed):
+        self.at, self.resets = 0, self.resets + 1
+
+    def step(self, action):
+        self.at += 1
+        reward = 100 * self.at + float(action[0]) + self.luck * self.resets
+        return None, reward, self.at == 20, False, {}
+
+
+@pytest.mark.parametrize("luck", [0, 1e-3])
+def test_dreams_are_taken_at_their_word(luck):
+    """From four moments of an episode the dream's own actions, not the episode's, are taken."""
+    agent = Agent(Settings(**TINY), actions=3, device=torch.device("cpu"), bfloat16=False)
+    agent.players["deterministic"].greedy = lambda state: torch.full((len(state), 3), 0.5)
+    agent.model.predict_reward = lambda state: torch.ones(state.shape[:-1])
+    agent.model.predict_continues = lambda state: torch.full(state.shape[:-1], 0.5)
+    env, episode = Counts(luck), made_up_episode(20, terminated=True)
+    env.reset(seed=7)
+    episode = episode._replace(rewards=np.array([env.step(a)[1] for a in episode.actions]))
+    found = diagnose.take_at_its_word(agent, env, "deterministic", episode, seed=7)
+    if luck:  # another episode than the one that was seen
+        assert found.shape == (0, 15, 2)
+        return
+    assert found.shape == (4, 15, 2)
+    np.testing.assert_array_equal(found[1, :, 0], 0.5 ** np.arange(15))  # alive so far
+    for real, moment in zip(found[..., 1], (0, 6, 12, 19), strict=True):
+        paid = [100 * k + 0.5 for k in range(moment + 1, 21)][:15]
+        np.testing.assert_array_equal(real, paid + [0] * (15 - len(paid)))  # 0 after the end
+
+
+def test_what_dreams_earn_is_summed_soon_and_later():
+    agent = Agent(Settings(**TINY), actions=3, device=torch.device("cpu"), bfloat16=False)
+    episode = made_up_episode(20, terminated=True)
+    own = np.stack([np.arange(15.0), np.ones(15)], -1)[None]
+    found = diagnose.measure(agent, "deterministic", episode) | {"own": own}
+    named = diagnose.figures(found, [episode])
+    assert [named[k] for k in list(named)[-4:]] == [10, 5, 95, 10]
+    assert diagnose.OWN not in diagnose.figures(found | {"own": own[:0]}, [episode])
+
+
 def test_returns_that_a_time_limit_cut_off_are_left_out():
     agent = Agent(Settings(**TINY), actions=3, device=torch.device("cpu"), bfloat16=False)
     found = diagnose.measure(agent, "deterministic", made_up_episode(320, terminated=False))
@@ -212,6 +259,9 @@ GOOD = {
     ({diagnose.EXPECTED: 3, diagnose.ENDS: 0, diagnose.DECISIONS: 2500}, "Nothing stands out"),
     ({diagnose.PROMISED: 200}, "promised than earned"),
     ({diagnose.PROMISED: -20, diagnose.EARNED: -90}, "promised than earned"),
+    ({diagnose.PROMISED: 200, diagnose.OWN: 20, diagnose.TAKEN: 18}, "promised than earned"),
+    ({diagnose.PROMISED: 200, diagnose.OWN: 20, diagnose.TAKEN: -7}, "dreams earn what"),
+    ({diagnose.OWN: 20, diagnose.TAKEN: -7}, "Nothing stands out"),  # and yet it earns as promised
     ({diagnose.AFTER: -0.5}, "dynamics are weak"),
 ])  # fmt: skip
 def test_the_verdict_names_what_to_look_at_first(worse, word):
