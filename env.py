@@ -182,7 +182,8 @@ class Foreign(gym.Wrapper, gym.utils.RecordConstructorArgs):
         settings = {"camera_distance": camera_distance, "floor_brightness": floor_brightness}
         gym.utils.RecordConstructorArgs.__init__(self, **settings)
         super().__init__(env)
-        self.name, self.age, self.state_size = env.spec.id, 0, 0  # age: steps of the episode
+        self.name, self.state_size = env.spec.id, 0
+        self.age, self.images = 0, 0  # steps of the episode, images since the environment was made
         with blame(self.name):
             self.box = box = env.action_space
             bounded = isinstance(box, gym.spaces.Box) and box.is_bounded()
@@ -195,13 +196,18 @@ class Foreign(gym.Wrapper, gym.utils.RecordConstructorArgs):
             with contextlib.suppress(Exception):  # a sequence, a graph, one of its own
                 size = gym.spaces.flatdim(env.observation_space)
                 self.state_size = size if size <= MAX_DIMENSIONS else 0
-            if hasattr(env.unwrapped, "_render_width"):
+            self.pybullet = hasattr(env.unwrapped, "_render_width")
+            if self.pybullet:
                 set_up_pybullet(env.unwrapped, **settings)
         self.reset(seed=0)
         self.render()
         self.step(np.zeros(box.shape, np.float32))
 
     def reset(self, *, seed=None, options=None):
+        # For each image PyBullet normalises its normals in place: every second image they round
+        # otherwise, which shows in a pixel of some thousand images. All episodes begin alike.
+        if self.pybullet and self.images % 2:
+            self.render()
         self.age = 0
         with blame(self.name, "at its reset"):
             return self.accept(self.env.reset(seed=seed, options=options), "observation, info")
@@ -223,6 +229,7 @@ class Foreign(gym.Wrapper, gym.utils.RecordConstructorArgs):
             return state, float(number.item()), bool(terminated), bool(truncated), info
 
     def render(self):
+        self.images += 1
         with blame(self.name, f"after its step {self.age}"):
             return to_pixels(self.env.render())
 
