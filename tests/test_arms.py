@@ -63,8 +63,8 @@ LEARNING = {
     "floor_brightness": (0.4, 1.0), "reward_weight": (20.0, 1.0), "squared_reward": (True, False),
     "action_penalty": (0.01, 0.0), "starts": (0.25, 1.0),
     "critic_lr": (5e-4, 8e-5),
-    "critic_norm": (True, False), "actor_lr": (2e-4, 8e-5), "horizon": (10, 15),
-    "play_rate": (0.01, 1.0), "termination_weight": (100.0, 10.0), "decode_share": (0.25, 1.0),
+    "critic_norm": (True, False), "actor_lr": (2e-4, 8e-5), "horizon": (5, 15),
+    "play_rate": (0.01, 1.0), "decode_share": (0.25, 1.0),
     "dream_noise": (0.3, 0.0), "collect": ("both", "explorer"), "ends_ahead": (5, 0),
     "burn_in": (2, 0),
 }  # fmt: skip

@@ -138,7 +138,7 @@ def test_a_run_of_other_settings_is_not_taken_for_the_one_asked_for(stand_in, ca
     with pytest.raises(SystemExit) as end:
         reproduce.main([*arguments, "--", "--horizon", "7"])
     said = capsys.readouterr().err.splitlines()[-1]
-    assert end.value.code == 2 and "a run with horizon 10: name another --out." in said
+    assert end.value.code == 2 and "a run with horizon 5: name another --out." in said
     older = asked.settings.to_json().replace('"ends_ahead"', '"heads_ahead"')
     (folder / "settings.json").write_text(older)
     with pytest.raises(SystemExit):
