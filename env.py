@@ -204,8 +204,9 @@ class Foreign(gym.Wrapper, gym.utils.RecordConstructorArgs):
         self.step(np.zeros(box.shape, np.float32))
 
     def reset(self, *, seed=None, options=None):
-        # For each image PyBullet normalises its normals in place: every second image they round
-        # otherwise, which shows in a pixel of some thousand images. All episodes begin alike.
+        # PyBullet normalises its normals in place at each image, so every second one rounds
+        # otherwise: one pixel differs in one of some thousand images. Hence each episode begins
+        # after an even number of them.
         if self.pybullet and self.images % 2:
             self.render()
         self.age = 0

@@ -2,9 +2,9 @@
 
     python results/diagnose.py runs/NAME
 
-plays the evaluation's episodes with each actor, and holds what the model says of them against what
-happened. Prints the figures and a verdict, and draws diagnosis-STEP.png in the run's folder. The
-run may still be going on: nothing of it is changed.
+plays the evaluation's episodes with each actor, holds what the model says of them against what
+happened, and takes the actions that it dreams of. Prints the figures and a verdict, and draws
+diagnosis-STEP.png in the run's folder. The run may still be going on: nothing of it is changed.
 """
 
 import argparse
@@ -25,11 +25,12 @@ from results.play import command_line, exit_code, load, open_loop, strip
 from results.plot import read_metrics
 from returns import survival
 from train import Agent, Patient
+from world_model import Dream
 
 LATE = 3  # decisions that a dream may be late with an end
 OPEN_LOOP = 15  # steps that the model is followed without images
-SOON = 5  # of these, those told apart from what comes later
-MOMENTS = 4  # of an episode, from which dreams are taken at their word
+SOON = 5  # the first of these decisions, told apart
+MOMENTS = 4  # of an episode, from which its actor's dreams are taken at their word
 
 # Names of the figures that the verdict looks at.
 DEVIATION = "deviation of the greedy action over states (near 0: frozen)"
@@ -44,8 +45,15 @@ OUTLIVED = f"chance that dreams outlive an end that came by {LATE} decisions"
 PROMISED = "discounted return that the model promised"
 EARNED = "discounted return that then happened"
 AFTER = f"rewards, R² after {OPEN_LOOP} steps without images"
-OWN = f"reward of decisions {SOON + 1} to {OPEN_LOOP} of its own dreams, sum"
-TAKEN = "what the later ones' actions earned when they were taken"
+
+
+def own_and_taken(decisions: int) -> tuple[str, str]:
+    """Names of the figures of what `take_at_its_word` finds in so many decisions."""
+    dreamt = f"rewards of the first {decisions} decisions of its own dreams, sum"
+    return dreamt, f"what these {decisions} earned when their actions were taken"
+
+
+OWN, TAKEN = own_and_taken(OPEN_LOOP)
 
 
 def r_squared(predicted: np.ndarray, real: np.ndarray) -> float:
@@ -104,7 +112,7 @@ def measure(agent: Agent, name: str, episode: Episode) -> dict[str, np.ndarray]:
     Returns, beside what `follow` does:
         reward, terminated, return: (M, 2) predicted and real, of each row; returns only where
         the real one is known, which in an episode cut off by a time limit is long before its end.
-        outlived: (at most H − 3,) chance that a dream outlives the end by 3, begun so far before.
+        outlived: (at most 12,) chance that a dream outlives the end by 3, begun so far before.
         seen_image: (L,) squared error of a pixel of an image that is seen: its reconstruction.
         saturated: (L, A) whether an action is within 0.01 of its bound.
         greedy, sigma: (L, A) the actor's greedy action in each state, and the explorer's σ.
@@ -116,8 +124,10 @@ def measure(agent: Agent, name: str, episode: Episode) -> dict[str, np.ndarray]:
     arrived_by = torch.cat([torch.zeros_like(actions[:1]), actions])
     is_first = torch.arange(len(images), device=agent.device) == 0
     states = model.observe(images[None], arrived_by[None], is_first[None]).state[0]  # (L + 1, D)
-    dream = model.imagine(states[:-1], actor, s.horizon)
-    believed = imagined_returns(dream, agent.critics[name], s.gamma, s.lam)[0]
+    dream = model.imagine(states[:-1], actor, max(s.horizon, OPEN_LOOP))
+    state, action = (x[: s.horizon + 1] for x in (dream.state, dream.action))
+    as_learnt = Dream(state, action, dream.reward[: s.horizon], dream.continues[: s.horizon])
+    believed = imagined_returns(as_learnt, agent.critics[name], s.gamma, s.lam)[0]
     # a reward 300 decisions ahead counts 0.05 at γ = 0.99: what a time limit cut off is then little
     unknown = 0 if episode.terminated else int(np.log(0.05) / np.log(min(s.gamma, 0.999)))
     known = slice(0, max(0, len(rewards) - unknown))
@@ -128,8 +138,8 @@ def measure(agent: Agent, name: str, episode: Episode) -> dict[str, np.ndarray]:
         "return": (believed[known], discounted(rewards, s.gamma)[known]),
     }
     found = {key: np.stack([p.cpu().numpy(), real], -1) for key, (p, real) in said.items()}
-    if episode.terminated and model.termination is not None and s.horizon > LATE:
-        left = torch.arange(min(len(rewards), s.horizon - LATE), 0, -1)
+    if episode.terminated and model.termination is not None:
+        left = torch.arange(min(len(rewards), OPEN_LOOP - LATE), 0, -1)
         survival = dream.continues[:, -len(left) :].cumprod(0).cpu()
         found["outlived"] = survival[left - 1 + LATE, torch.arange(len(left))].numpy()
     found["saturated"] = np.abs(episode.actions) > 0.99
@@ -166,31 +176,40 @@ def follow(model, states: Tensor, images: Tensor, actions: Tensor, rewards: Tens
 
 @torch.no_grad()
 def take_at_its_word(agent: Agent, env, name: str, episode: Episode, seed: int) -> np.ndarray:
-    """Dreams of an actor's own actions from some moments of its episode, beside the environment,
-    in which the episode is repeated up to there and then these actions are taken, whatever is met.
+    """What dreams of an actor's own actions promise, and what these actions earn.
+
+    It dreams on from a few moments of its episode. In the environment the episode is repeated up to
+    there, and then the dream's actions are taken, whatever is met.
 
     Returns:
-        (M, H, 2) dreamt and real reward of 1 … H decisions: dreamt, weighted by survival until
-        then; real, 0 after an end. M is 0 if the environment does not repeat itself.
+        (M, 15, 2) dreamt and real reward of each of 15 decisions: dreamt, times survival until
+        then; real, 0 after an end. What a time limit cuts off is left out. None, M = 0, if the
+        environment does not repeat itself.
     """
-    length, rewards = len(episode.rewards), []
-    last = length - 1 if episode.terminated else max(0, length - OPEN_LOOP)
-    moments = np.unique(np.linspace(0, last, MOMENTS).astype(int))
+    last = len(episode.rewards) - (1 if episode.terminated else OPEN_LOOP)
+    moments = np.unique(np.linspace(0, max(0, last), MOMENTS).astype(int))
     dream = agent.model.imagine(episode.states[moments], agent.players[name].greedy, OPEN_LOOP)
-    own = dream.action.transpose(0, 1).cpu().numpy()
-    for moment, actions in zip(moments, own, strict=True):
-        env.reset(seed=seed)
-        before = [env.step(action)[1] for action in episode.actions[:moment]]
-        if not np.array_equal(before, episode.rewards[:moment]):
-            return np.zeros((0, OPEN_LOOP, 2))
-        came, over = [], False
-        while len(came) < OPEN_LOOP and not over:
-            _, reward, terminated, truncated, _ = env.step(actions[len(came)])
-            came.append(reward)
-            over = terminated or truncated
-        rewards.append(came + [0.0] * (OPEN_LOOP - len(came)))
     dreamt = (survival(dream.continues) * dream.reward).T.cpu().numpy()
-    return np.stack([dreamt, np.array(rewards)], -1)
+    chosen, both = dream.action.transpose(0, 1).cpu().numpy(), []
+    for moment, own, promised in zip(moments, chosen, dreamt, strict=True):
+        image, _ = env.reset(seed=seed)
+        images, rewards, ended, cut_off = [image], [], False, False
+        for action in [*episode.actions[:moment], *own[:OPEN_LOOP]]:
+            if not (ended or cut_off):
+                image, reward, ended, cut_off, _ = env.step(action)
+                images.append(image), rewards.append(reward)
+        before, came = rewards[:moment], rewards[moment:]
+        if not (
+            came
+            and np.array_equal(images[moment], episode.images[moment])
+            and np.array_equal(before, episode.rewards[:moment])
+        ):
+            return np.zeros((0, OPEN_LOOP, 2))
+        if ended or len(came) == OPEN_LOOP:
+            real = np.zeros(OPEN_LOOP)
+            real[: len(came)] = came
+            both.append(np.stack([promised, real], -1))
+    return np.array(both).reshape(-1, OPEN_LOOP, 2)
 
 
 def figures(found: dict[str, np.ndarray], episodes: list[Episode]) -> dict[str, float]:
@@ -226,10 +245,9 @@ def figures(found: dict[str, np.ndarray], episodes: list[Episode]) -> dict[str, 
             named[f"image error after {k} steps, grey levels of 255"] = error
             named[f"the same, of the last image seen for {k} steps"] = still
     if "own" in found and len(found["own"]):
-        soon, later = (part.sum(1).mean(0) for part in np.split(found["own"], [SOON], axis=1))
-        named[f"reward of the first {SOON} decisions of its own dreams, sum"] = soon[0]
-        named["what their actions earned when they were taken"] = soon[1]
-        named |= {OWN: later[0], TAKEN: later[1]}
+        for count in (SOON, OPEN_LOOP):
+            sums = found["own"][:, :count].sum(1).mean(0)
+            named |= dict(zip(own_and_taken(count), sums, strict=True))
     return named
 
 
@@ -297,8 +315,8 @@ def draw(path: Path, agent: Agent, played, found, metrics) -> None:
 
 
 def exceeds(of: dict[str, float], promised: str, earned: str) -> bool:
-    """Whether one figure is more than half as much again as the other, and by more than 1, which is
-    for those about 0; a critic that lags is off by less."""
+    """Whether one figure is above the other by more than half of that and 1, which is for those
+    about 0; a critic that lags is off by less."""
     return of.get(promised, 0) - of.get(earned, 0) > 0.5 * abs(of.get(earned, 0)) + 1
 
 
@@ -321,7 +339,7 @@ VERDICTS = (
      "the model expects ends that do not come: nothing far off counts in its dreams."),
     # Of what is promised too much: are the dreams wrong, or what the critic makes of them?
     (lambda of: exceeds(of, PROMISED, EARNED) and exceeds(of, OWN, TAKEN),
-     "dreams earn what their actions do not: the actor exploits the model's errors."),
+     "its dreams earn what their actions do not: the model is wrong about what this actor does."),
     (lambda of: exceeds(of, PROMISED, EARNED),
      "more is promised than earned: the critic lags, or believes too much of its dreams."),
     # Chance alone takes some of it in 15 steps.

@@ -52,7 +52,7 @@ PAPER = dict(
     lam=0.95, gamma_q=0.9, beta_start=0.2, beta_end=0.0001, mdn_components=8, mdn_units=256,
     target_rate=0.1, model_lr=6e-4, actor_lr=8e-5, critic_lr=8e-5, mdn_lr=2e-4, grad_clip=100,
     free_nats=3, reward_weight=1, kl_weight=1, kl_standard_weight=0.1, jeffreys_weight=0.1,
-    eval_episodes=10,
+    eval_episodes=10, termination_weight=10,
 )  # fmt: skip
 SIZES = {"deter", "stoch", "hidden", "units", "depth", "batch_size", "length", "mdn_units"}
 CADENCE = {"steps", "prefill", "train_every", "updates", "eval_every"}

@@ -176,7 +176,7 @@ def test_same_seed_and_actions_give_the_same_episode_whatever_was_played_before(
 
 def test_an_episode_does_not_show_how_many_images_were_drawn_before_it(make):
     """PyBullet draws the last of these images in two ways, in turn: one number of a pixel differs.
-    On other machines it may not; that all episodes begin after an even number can be held there."""
+    On other machines it may not; there the test holds the count alone."""
     env, images = make(IDS[0], camera_distance=1.7), []
     nearly_alike = [
         [-0.29635530710220337, -0.007498043589293957, 0.4204024374485016],

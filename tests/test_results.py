@@ -82,7 +82,7 @@ def test_what_is_measured_is_the_actor_that_played(name):
     assert not found["greedy"].any()
 
 
-@pytest.mark.parametrize("length, steps", [(30, 2), (1, 1)])
+@pytest.mark.parametrize("length, steps", [(30, 12), (1, 1)])
 def test_dreams_outlive_an_end_by_all_the_decisions_before_it(length, steps):
     """c is ½ everywhere: begun k decisions before the end, one in 2^(k+3) lives 3 longer."""
     agent = Agent(Settings(**TINY), actions=3, device=torch.device("cpu"), bfloat16=False)
@@ -107,40 +107,65 @@ def test_open_loop_follows_the_actions_taken():
 
 
 class Counts:
-    """Pays 100 times the step's number and the action, to its 20th step; at each reset more, if it
-    does not repeat itself."""
+    """Shows and pays the step's number, and 100 times the action, for so many steps; at each reset
+    more, if it does not repeat itself."""
 
-    def __init__(self, luck=0.0):
-        self.luck, self.resets = luck, 0
+    def __init__(self, life: int, terminates=True, luck=0):
+        self.life, self.terminates, self.luck, self.resets = life, terminates, luck, 0
+
+    def image(self):
+        return np.full((64, 64, 3), self.at + self.luck * self.resets, np.uint8)
 
     def reset(self, seed):
         self.at, self.resets = 0, self.resets + 1
+        return self.image(), {}
 
     def step(self, action):
+        assert self.at < self.life
         self.at += 1
-        reward = 100 * self.at + float(action[0]) + self.luck * self.resets
-        return None, reward, self.at == 20, False, {}
+        over = self.at == self.life
+        ends = over and self.terminates, over and not self.terminates
+        return self.image(), self.at + 100 * float(action[0]), *ends, {}
 
 
-@pytest.mark.parametrize("luck", [0, 1e-3])
-def test_dreams_are_taken_at_their_word(luck):
-    """From four moments of an episode the dream's own actions, not the episode's, are taken."""
+def taken_at_its_word(env: Counts, length: int) -> np.ndarray:
+    """In state t, dreamt or real, the actor's action is t / 1000; all dreams pay 1 a decision, and
+    are alive with ½ after each. The episode's own actions are others."""
     agent = Agent(Settings(**TINY), actions=3, device=torch.device("cpu"), bfloat16=False)
-    agent.players["deterministic"].greedy = lambda state: torch.full((len(state), 3), 0.5)
+    agent.players["deterministic"].greedy = lambda state: state[:, :3] / 1000
+    agent.model.step = lambda state, action: state + 1
     agent.model.predict_reward = lambda state: torch.ones(state.shape[:-1])
     agent.model.predict_continues = lambda state: torch.full(state.shape[:-1], 0.5)
-    env, episode = Counts(luck), made_up_episode(20, terminated=True)
-    env.reset(seed=7)
-    episode = episode._replace(rewards=np.array([env.step(a)[1] for a in episode.actions]))
-    found = diagnose.take_at_its_word(agent, env, "deterministic", episode, seed=7)
-    if luck:  # another episode than the one that was seen
-        assert found.shape == (0, 15, 2)
-        return
-    assert found.shape == (4, 15, 2)
-    np.testing.assert_array_equal(found[1, :, 0], 0.5 ** np.arange(15))  # alive so far
-    for real, moment in zip(found[..., 1], (0, 6, 12, 19), strict=True):
-        paid = [100 * k + 0.5 for k in range(moment + 1, 21)][:15]
-        np.testing.assert_array_equal(real, paid + [0] * (15 - len(paid)))  # 0 after the end
+    episode = made_up_episode(length, env.terminates and length == env.life)
+    images, rewards = [env.reset(seed=7)[0]], []
+    for action in episode.actions:
+        image, reward, *_ = env.step(action)
+        images.append(image), rewards.append(reward)
+    states = torch.arange(float(length))[:, None].expand(length, agent.model.size)
+    episode = episode._replace(images=np.array(images), rewards=np.array(rewards), states=states)
+    return diagnose.take_at_its_word(agent, env, "deterministic", episode, seed=7)
+
+
+@pytest.mark.parametrize("length, moments", [(20, (0, 6, 12, 19)), (1, (0,))])
+def test_dreams_are_taken_at_their_word(length, moments):
+    """From some moments of an episode the dream's own actions, not the episode's, are taken."""
+    found = taken_at_its_word(Counts(length), length)
+    assert found.shape == (len(moments), 15, 2)
+    np.testing.assert_array_equal(found[0, :, 0], 0.5 ** np.arange(15))  # alive so far
+    for real, moment in zip(found[..., 1], moments, strict=True):
+        paid = [t + 1 + t / 10 for t in range(moment, length)][:15]
+        np.testing.assert_allclose(real, paid + [0] * (15 - len(paid)))  # 0 after the end
+
+
+@pytest.mark.parametrize("length, count", [(40, 4), (15, 1), (14, 0)])
+def test_what_a_time_limit_cuts_off_of_a_dream_is_left_out(length, count):
+    found = taken_at_its_word(Counts(length, terminates=False), length)
+    assert found.shape == (count, 15, 2) and found.all()
+
+
+@pytest.mark.parametrize("length", [1, 20])
+def test_no_dream_is_taken_at_its_word_where_no_episode_repeats_itself(length):
+    assert taken_at_its_word(Counts(length, luck=1), length).shape == (0, 15, 2)
 
 
 def test_what_dreams_earn_is_summed_soon_and_later():
@@ -149,7 +174,10 @@ def test_what_dreams_earn_is_summed_soon_and_later():
     own = np.stack([np.arange(15.0), np.ones(15)], -1)[None]
     found = diagnose.measure(agent, "deterministic", episode) | {"own": own}
     named = diagnose.figures(found, [episode])
-    assert [named[k] for k in list(named)[-4:]] == [10, 5, 95, 10]
+    assert list(named.items())[-4:] == [
+        *zip(diagnose.own_and_taken(5), (10, 5), strict=True),
+        *zip((diagnose.OWN, diagnose.TAKEN), (105, 15), strict=True),
+    ]
     assert diagnose.OWN not in diagnose.figures(found | {"own": own[:0]}, [episode])
 
 
@@ -171,7 +199,7 @@ def test_a_run_is_diagnosed_and_left_as_it_is(tmp_path, capsys):
     assert page.stat().st_size > 10_000
     assert {path: path.read_bytes() for path in folder.iterdir() if path != page} == before
     said = capsys.readouterr()
-    assert "deterministic" in said.out and not said.err
+    assert "deterministic" in said.out and diagnose.OWN in said.out and not said.err
     for metrics in ("env_steps,eval_return\n60,", "a\n1\n", ""):  # half written, foreign, empty
         (folder / "metrics.csv").write_text(metrics)
         assert diagnose.main([str(folder), "--episodes", "1", "--checkpoint", "best"]) == 0
@@ -260,7 +288,7 @@ GOOD = {
     ({diagnose.PROMISED: 200}, "promised than earned"),
     ({diagnose.PROMISED: -20, diagnose.EARNED: -90}, "promised than earned"),
     ({diagnose.PROMISED: 200, diagnose.OWN: 20, diagnose.TAKEN: 18}, "promised than earned"),
-    ({diagnose.PROMISED: 200, diagnose.OWN: 20, diagnose.TAKEN: -7}, "dreams earn what"),
+    ({diagnose.PROMISED: 200, diagnose.OWN: 20, diagnose.TAKEN: -7}, "what this actor does"),
     ({diagnose.OWN: 20, diagnose.TAKEN: -7}, "Nothing stands out"),  # and yet it earns as promised
     ({diagnose.AFTER: -0.5}, "dynamics are weak"),
 ])  # fmt: skip
