@@ -129,7 +129,7 @@ def show(command: argparse.Namespace) -> None:
     print(f"{path}: the episode, what is seen of it, difference; dream from 5 images, difference")
     if command.video:
         path = folder / f"episode-{name}.gif"
-        film(path, open_loop(agent, best, frames=100), env.metadata["render_fps"])
+        film(path, open_loop(agent, best, frames=75), env.metadata["render_fps"])
         print(f"{path}: the episode, dream from its first 5 images and its actions, difference")
 
 

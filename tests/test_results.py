@@ -13,6 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
+import actors
 import results.baseline as baseline
 import results.diagnose as diagnose
 import results.frozen as frozen
@@ -629,9 +630,18 @@ def test_committed_runs_are_of_this_programs_settings():
         assert settings["arm"] in baseline.USUAL or settings.keys() == fields, path
 
 
+def test_the_networks_of_the_whole_runs_can_be_played():
+    paths = list(RESULTS.glob("whole/*/best.pt"))
+    assert paths and sum(path.stat().st_size for path in paths) < 40e6
+    for path in paths:
+        _, env, agent, name = play.load(path.parent, "best", "cpu", "float32")
+        episode = actors.play(agent, env, agent.evaluated.greedy, seed=0, most=10)
+        assert name == "best" and np.isfinite(episode.actions).all(), path
+
+
 def test_committed_runs_of_the_old_view_are_whole():
     paths = list(RESULTS.glob("old_view/**/settings.json"))
-    assert len(paths) == 23
+    assert len(paths) == 27
     for path in paths:
         last = path.with_name("metrics.csv").read_text().splitlines()[-1]
         assert int(last.split(",")[0]) >= json.loads(path.read_text())["steps"], path
