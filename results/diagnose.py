@@ -25,7 +25,6 @@ from results.play import command_line, exit_code, load, open_loop, strip
 from results.plot import read_metrics
 from returns import survival
 from train import Agent, Patient
-from world_model import Dream
 
 LATE = 3  # decisions that a dream may be late with an end
 OPEN_LOOP = 15  # steps that the model is followed without images
@@ -124,10 +123,8 @@ def measure(agent: Agent, name: str, episode: Episode) -> dict[str, np.ndarray]:
     arrived_by = torch.cat([torch.zeros_like(actions[:1]), actions])
     is_first = torch.arange(len(images), device=agent.device) == 0
     states = model.observe(images[None], arrived_by[None], is_first[None]).state[0]  # (L + 1, D)
-    dream = model.imagine(states[:-1], actor, max(s.horizon, OPEN_LOOP))
-    state, action = (x[: s.horizon + 1] for x in (dream.state, dream.action))
-    as_learnt = Dream(state, action, dream.reward[: s.horizon], dream.continues[: s.horizon])
-    believed = imagined_returns(as_learnt, agent.critics[name], s.gamma, s.lam)[0]
+    dream = model.imagine(states[:-1], actor, s.horizon)
+    believed = imagined_returns(dream, agent.critics[name], s.gamma, s.lam)[0]
     # a reward 300 decisions ahead counts 0.05 at γ = 0.99: what a time limit cut off is then little
     unknown = 0 if episode.terminated else int(np.log(0.05) / np.log(min(s.gamma, 0.999)))
     known = slice(0, max(0, len(rewards) - unknown))
@@ -140,8 +137,9 @@ def measure(agent: Agent, name: str, episode: Episode) -> dict[str, np.ndarray]:
     found = {key: np.stack([p.cpu().numpy(), real], -1) for key, (p, real) in said.items()}
     if episode.terminated and model.termination is not None:
         left = torch.arange(min(len(rewards), OPEN_LOOP - LATE), 0, -1)
-        survival = dream.continues[:, -len(left) :].cumprod(0).cpu()
-        found["outlived"] = survival[left - 1 + LATE, torch.arange(len(left))].numpy()
+        before_end = model.imagine(states[-1 - len(left) : -1], actor, OPEN_LOOP)
+        alive = before_end.continues.cumprod(0).cpu()  # in s_1 … s_15
+        found["outlived"] = alive[left - 1 + LATE, torch.arange(len(left))].numpy()
     found["saturated"] = np.abs(episode.actions) > 0.99
     found["greedy"] = actor.greedy(states[:-1]).cpu().numpy()
     if hasattr(actor, "distribution"):
@@ -190,14 +188,15 @@ def take_at_its_word(agent: Agent, env, name: str, episode: Episode, seed: int) 
     moments = np.unique(np.linspace(0, max(0, last), MOMENTS).astype(int))
     dream = agent.model.imagine(episode.states[moments], agent.players[name].greedy, OPEN_LOOP)
     dreamt = (survival(dream.continues) * dream.reward).T.cpu().numpy()
-    chosen, both = dream.action.transpose(0, 1).cpu().numpy(), []
+    chosen, both = dream.action[:-1].transpose(0, 1).cpu().numpy(), []
     for moment, own, promised in zip(moments, chosen, dreamt, strict=True):
         image, _ = env.reset(seed=seed)
-        images, rewards, ended, cut_off = [image], [], False, False
-        for action in [*episode.actions[:moment], *own[:OPEN_LOOP]]:
-            if not (ended or cut_off):
-                image, reward, ended, cut_off, _ = env.step(action)
-                images.append(image), rewards.append(reward)
+        images, rewards = [image], []
+        for action in [*episode.actions[:moment], *own]:
+            image, reward, ended, cut_off, _ = env.step(action)
+            images.append(image), rewards.append(reward)
+            if ended or cut_off:
+                break
         before, came = rewards[:moment], rewards[moment:]
         if not (
             came

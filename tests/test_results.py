@@ -88,8 +88,16 @@ def test_dreams_outlive_an_end_by_all_the_decisions_before_it(length, steps):
     """c is ½ everywhere: begun k decisions before the end, one in 2^(k+3) lives 3 longer."""
     agent = Agent(Settings(**TINY), actions=3, device=torch.device("cpu"), bfloat16=False)
     agent.model.predict_continues = lambda state: torch.full(state.shape[:-1], 0.5)
+    imagine, begun = agent.model.imagine, {}
+
+    def watched(start, policy, horizon):
+        begun[horizon] = start
+        return imagine(start, policy, horizon)
+
+    agent.model.imagine = watched
     episode = made_up_episode(length, terminated=True)
     found = diagnose.measure(agent, "deterministic", episode)
+    assert torch.equal(begun[15], begun[5][-steps:])  # from the last states that were acted in
     assert found["outlived"].tolist() == [0.5 ** (k + 3) for k in range(steps, 0, -1)]
     assert diagnose.figures(found, [episode])[diagnose.OUTLIVED] == found["outlived"].mean()
     cut_off = diagnose.measure(agent, "deterministic", made_up_episode(length, terminated=False))
