@@ -353,8 +353,8 @@ def passed(before: int, after: int, every: int) -> int:
 
 
 def to_tensors(rows: np.ndarray, device: torch.device) -> dict[str, Tensor]:
-    """Records of the replay as one tensor a field, in memory of torch's own: Intel's MKL, for
-    one, may round otherwise where arrays are aligned otherwise, and a resumed run's would be."""
+    """Records of the replay as one tensor a field, copied into memory of torch's own: where
+    arrays lie may change how a product is rounded, and a resumed run's lie elsewhere."""
     return {name: torch.tensor(rows[name], device=device) for name in rows.dtype.names}
 
 
@@ -370,7 +370,7 @@ def evaluate(agent: "Agent", env, s: Settings, show=lambda text: None) -> list[t
     episodes = []
     for k in range(rank(), s.eval_episodes, processes()):
         show(f"evaluating, episode {k + 1} of {s.eval_episodes}")
-        seed = 2**31 - 1 - k  # some environments take none that is larger
+        seed = evaluation_seed(k)
         try:
             episode = play(agent, env, agent.evaluated.greedy, seed, s.eval_max_steps)
         except EnvironmentFault as error:  # what only measures never stops a run
@@ -378,6 +378,11 @@ def evaluate(agent: "Agent", env, s: Settings, show=lambda text: None) -> list[t
             continue
         episodes.append((episode.total, episode.length))
     return episodes
+
+
+def evaluation_seed(k: int) -> int:
+    """Of the k-th episode, from 0, of every evaluation, here and in results/."""
+    return 2**31 - 1 - k  # some environments take none that is larger
 
 
 def interval95(returns: np.ndarray) -> float:

@@ -85,7 +85,7 @@ class Record:
 
     def report(self, model) -> None:
         """A row of metrics.csv, and a line."""
-        played = [episode(model, self.world, 2**31 - 1 - k) for k in range(EPISODES)]
+        played = [episode(model, self.world, train.evaluation_seed(k)) for k in range(EPISODES)]
         returns, lengths = np.array(played).T
         covered, self.visited = coverage(np.array(self.visited)), []
         found = returns.mean(), train.interval95(returns), lengths.mean(), covered

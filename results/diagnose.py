@@ -24,7 +24,7 @@ from actors import Episode, imagined_returns, play
 from results.play import command_line, exit_code, load, open_loop, strip
 from results.plot import read_metrics
 from returns import survival
-from train import Agent, Patient
+from train import Agent, Patient, evaluation_seed
 
 LATE = 3  # decisions that a dream may be late with an end
 OPEN_LOOP = 15  # steps that the model is followed without images
@@ -92,7 +92,7 @@ def play_all(agent: Agent, env, name: str, alive: list[float], count: int):
     s, episodes, found = agent.s, [], defaultdict(list)
     for k in range(count):
         alive.clear()
-        seed = 2**31 - 1 - k
+        seed = evaluation_seed(k)
         episode = play(agent, env, agent.players[name], seed, s.eval_max_steps)
         episodes.append(episode)
         for key, value in measure(agent, name, episode).items():

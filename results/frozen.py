@@ -67,8 +67,9 @@ def learn(command: argparse.Namespace, settings: list[str]) -> None:
         promised.append(train.as_numbers(metrics)[f"{name}_actor/return"])
         agent.follow()
         if updates % command.every == 0:
-            policy, seeds = agent.players[name].greedy, range(command.episodes)
-            episodes = [play(agent, env, policy, 2**31 - 1 - k, s.eval_max_steps) for k in seeds]
+            policy = agent.players[name].greedy
+            seeds = [train.evaluation_seed(k) for k in range(command.episodes)]
+            episodes = [play(agent, env, policy, seed, s.eval_max_steps) for seed in seeds]
             earned = " ".join(f"{e.total:.0f} ({e.length})" for e in episodes)
             said = f"promised {np.mean(promised[-50:]):.1f}, discounted; earned {earned}"
             print(f"{updates} updates: {said}", flush=True)

@@ -111,7 +111,7 @@ def show(command: argparse.Namespace) -> None:
     if command.actor not in ("evaluated", *agent.players):
         raise ValueError(f"{folder} has no {command.actor} actor: leave out --actor.")
     actor = agent.evaluated if command.actor == "evaluated" else agent.players[command.actor]
-    seeds = [2**31 - 1 - k for k in range(command.episodes)]  # those of every evaluation
+    seeds = [train.evaluation_seed(k) for k in range(command.episodes)]
     episodes = [play(agent, env, actor.greedy, seed, s.eval_max_steps) for seed in seeds]
     returns, lengths = np.array([(e.total, e.length) for e in episodes]).T
     spread = f" ± {train.interval95(returns):.1f} (95% interval)" if len(returns) > 1 else ""

@@ -19,7 +19,7 @@ from gymnasium import wrappers
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import env  # registers the PyBullet environments
-from train import Settings, interval95
+from train import Settings, evaluation_seed, interval95
 
 
 def episode(world: gym.Env, seed: int, policy) -> tuple[float, int]:
@@ -61,7 +61,7 @@ if __name__ == "__main__":
     for name in ("Hopper", "Walker2D", "HalfCheetah", "Ant"):
         world = make(name)
         for policy, act in policies(world).items():
-            played = [episode(world, 2**31 - 1 - k, act) for k in range(10)]
+            played = [episode(world, evaluation_seed(k), act) for k in range(10)]
             returns, lengths = np.array(played).T
             row = f"{returns.mean():.1f},{interval95(returns):.1f},{lengths.mean():.1f}"
             lines.append(f"{name}BulletEnv-v0,{policy},{row}")
