@@ -75,7 +75,7 @@ class Settings:
 
     steps: Count = 100_000  # environment steps of the run, prefill included (ours)
     prefill: Whole = 5000  # environment steps of random actions before training (Dreamer: 5000)
-    train_every: Count = 10  # environment steps between two rounds of updates (Dreamer: 1000)
+    train_every: Count = 6  # environment steps between two rounds of updates (Dreamer: 1000)
     updates: Size = 1  # gradient updates a round (Dreamer: 100)
     eval_every: Count = 5_000  # environment steps between evaluations, once training began (ours)
     eval_episodes: Size = 10  # episodes an evaluation (§5: 10)
@@ -158,7 +158,7 @@ ARMS = {  # what each curve of the paper's figure changes in `Settings`, whose o
 }
 PRESETS = {
     "small": dict(  # sizes and cadence for two CPU cores, and what results/trials.md found to help
-        deter=128, stoch=64, hidden=128, units=128, depth=16, batch_size=20, length=25,
+        deter=128, stoch=64, hidden=128, units=128, depth=16, batch_size=10, length=25,
         mdn_units=128, prefill=2000, starts=0.25, floor_brightness=0.4, reward_weight=20.0,
         squared_reward=True, smooth_l1=False, ends_ahead=5, burn_in=2, action_penalty=0.01,
         critic_lr=5e-4, critic_norm=True, actor_lr=2e-4, horizon=5, play_rate=0.01,
