@@ -353,8 +353,8 @@ def passed(before: int, after: int, every: int) -> int:
 
 
 def to_tensors(rows: np.ndarray, device: torch.device) -> dict[str, Tensor]:
-    """Records of the replay as one tensor a field, copied into memory of torch's own: where
-    arrays lie may change how a product is rounded, and a resumed run's lie elsewhere."""
+    """Records of the replay as one tensor a field, copied into memory of torch's own, so
+    that nothing depends on where the replay's arrays lie (not seen to matter: trials, P)."""
     return {name: torch.tensor(rows[name], device=device) for name in rows.dtype.names}
 
 
@@ -381,7 +381,7 @@ def evaluate(agent: "Agent", env, s: Settings, show=lambda text: None) -> list[t
 
 
 def evaluation_seed(k: int) -> int:
-    """Of the k-th episode, from 0, of every evaluation, here and in results/."""
+    """The seed of the k-th episode, from 0, of every evaluation, here and in results/."""
     return 2**31 - 1 - k  # some environments take none that is larger
 
 

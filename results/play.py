@@ -95,7 +95,7 @@ def film(path: Path, pictures: np.ndarray, fps: float) -> None:
             ImageDraw.Draw(image).text((128 * column + 4, 0), label, "white")
         frames.append(image)
     some = np.concatenate([np.asarray(f) for f in frames[:: len(frames) // 10 + 1]])
-    palette = Image.fromarray(some).quantize(64)  # a frame's own would leave out rare colours
+    palette = Image.fromarray(some).quantize(128)  # a frame's own would leave out rare colours
     frames = [f.quantize(palette=palette, dither=Image.Dither.NONE) for f in frames]
     # A GIF counts hundredths of a second: rounded one by one, 33 ms would be 30.
     shown = np.diff(np.rint(np.arange(len(frames) + 1) * 100 * every / fps) * 10).tolist()
