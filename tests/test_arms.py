@@ -21,6 +21,7 @@ from train import (
     as_numbers,
     beta_at,
     default_settings,
+    evaluation_seed,
     interval95,
     live_rows,
     parse,
@@ -228,6 +229,11 @@ def test_beta_falls_linearly_from_a_fifth_to_a_ten_thousandth():
     s = default_settings("maxent", "paper")
     betas = [beta_at(step, s) for step in (0, 500_000, 1_000_000, 1_000_007)]
     assert betas == pytest.approx([0.2, 0.10005, 0.0001, 0.0001], abs=1e-12)
+
+
+def test_each_episode_of_an_evaluation_has_a_seed_of_its_own_that_any_environment_takes():
+    """Those of the committed runs and of reference.csv: others would not compare."""
+    assert [evaluation_seed(k) for k in range(3)] == [2147483647, 2147483646, 2147483645]
 
 
 def test_interval_is_students():
