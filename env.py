@@ -46,7 +46,7 @@ def silence():
 
 with silence():
     import pybullet
-    import pybullet_envs_gymnasium  # noqa: F401, registers the PyBullet environments
+    from pybullet_envs_gymnasium.env_bases import MJCFBaseBulletEnv  # registers them, too
 
     # Robots ask client 0 for their Euler angles, whichever is theirs. Were that the first robot's,
     # no other could go on after it is closed: "Not connected to physics server".
@@ -196,7 +196,7 @@ class Foreign(gym.Wrapper, gym.utils.RecordConstructorArgs):
             with contextlib.suppress(Exception):  # a sequence, a graph, one of its own
                 size = gym.spaces.flatdim(env.observation_space)
                 self.state_size = size if size <= MAX_DIMENSIONS else 0
-            self.pybullet = hasattr(env.unwrapped, "_render_width")
+            self.pybullet = isinstance(env.unwrapped, MJCFBaseBulletEnv)
             if self.pybullet:
                 set_up_pybullet(env.unwrapped, **settings)
         self.reset(seed=0)

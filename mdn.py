@@ -53,7 +53,8 @@ class Mixture(NamedTuple):
 
 
 class MixtureDensityNetwork(nn.Module):
-    """P(· | s): the mixture density network of §4.1, 8 components on two hidden layers of 256 (§5).
+    """P(· | s): the mixture density network of §4.1, 8 components, hidden layers of 256 (§5; that
+    there are two is ours).
 
     Args:
         size: D, numbers in a state.

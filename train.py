@@ -28,6 +28,7 @@ import subprocess
 import sys
 import threading
 import time
+import timeit
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -41,9 +42,8 @@ import torch.distributed as dist
 import tyro
 from annotated_types import Interval
 from pydantic import TypeAdapter, ValidationError
-from scipy import stats
+from scipy.special import stdtrit
 from torch import Tensor, nn
-from torch.utils import benchmark
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
@@ -75,12 +75,12 @@ class Settings:
 
     steps: Count = 100_000  # environment steps of the run, prefill included (ours)
     prefill: Whole = 5000  # environment steps of random actions before training (Dreamer: 5000)
-    train_every: Count = 6  # environment steps between two rounds of updates (Dreamer: 1000)
-    updates: Size = 1  # gradient updates a round (Dreamer: 100)
+    train_every: Count = 1000  # environment steps between two rounds of updates (Dreamer: 1000)
+    updates: Size = 100  # gradient updates a round (Dreamer: 100)
     eval_every: Count = 5_000  # environment steps between evaluations, once training began (ours)
     eval_episodes: Size = 10  # episodes an evaluation (§5: 10)
     eval_max_steps: Count = 10_000  # environment steps after which one of them is ended (ours)
-    checkpoint_minutes: Amount = 5.0  # between two checkpoints (ours)
+    checkpoint_minutes: Amount = 5.0  # at most, between two checkpoints (ours)
     replay_capacity: Count = 500_000  # rows (decisions) of experience kept (ours)
     action_repeat: Size = 2  # environment steps a decision (Dreamer)
     camera_distance: Amount = 1.7  # metres to a PyBullet robot; 3 is the environment's own (ours)
@@ -159,12 +159,13 @@ ARMS = {  # what each curve of the paper's figure changes in `Settings`, whose o
 PRESETS = {
     "small": dict(  # sizes and cadence for two CPU cores, and what results/trials.md found to help
         deter=128, stoch=64, hidden=128, units=128, depth=16, batch_size=10, length=25,
-        mdn_units=128, prefill=2000, starts=0.25, floor_brightness=0.4, reward_weight=20.0,
-        squared_reward=True, smooth_l1=False, ends_ahead=5, burn_in=2, action_penalty=0.01,
-        critic_lr=5e-4, critic_norm=True, actor_lr=2e-4, horizon=5, play_rate=0.01,
-        decode_share=0.25, dream_noise=0.3, collect="both", action_noise=0.3, random_action=0.01,
+        mdn_units=128, prefill=2000, train_every=6, updates=1, starts=0.25, floor_brightness=0.4,
+        reward_weight=20.0, squared_reward=True, smooth_l1=False, ends_ahead=5, burn_in=2,
+        action_penalty=0.01, critic_lr=5e-4, critic_norm=True, actor_lr=2e-4, horizon=5,
+        play_rate=0.01, decode_share=0.25, dream_noise=0.3, collect="both", action_noise=0.3,
+        random_action=0.01,
     ),
-    "paper": dict(steps=1_000_000, train_every=1000, updates=100),
+    "paper": dict(steps=1_000_000),
 }
 # fmt: on
 
@@ -175,7 +176,7 @@ def default_settings(arm: Arm = "maxent", preset: Preset = "small") -> Settings:
 
 
 def update(
-    agent: "Agent", batch: dict[str, Tensor], beta: float, s: Settings, look: bool = False
+    agent: "Agent", batch: dict[str, Tensor], beta: float, look: bool = False
 ) -> dict[str, float]:
     """One gradient update of the world model, then of each actor with its critic, and of the MDN.
 
@@ -188,6 +189,7 @@ def update(
         named metrics; the world model's are the unweighted terms of its loss. A FloatingPointError
         names those that are not finite; from the first such gradient on, nothing was changed.
     """
+    s = agent.s
     # First, while a GPU is idle: `nonzero` waits for all that it has under way.
     live = live_rows(agent, batch)
     weights = {
@@ -202,7 +204,7 @@ def update(
     agent.step("model", loss, metrics)
     starts = dream_starts(states, live, s.starts)
     for name in agent.actors:
-        update_actor(agent, name, starts, beta, s, metrics, look)
+        update_actor(agent, name, starts, beta, metrics, look)
     numbers = as_numbers(metrics)
     agent.follow()
     return numbers
@@ -241,15 +243,14 @@ def dream_starts(states: Tensor, live: Tensor, share: float) -> Tensor:
 
 
 def update_actor(
-    agent: "Agent", name: str, starts: Tensor, beta: float, s: Settings,
-    metrics: dict[str, Tensor], look: bool,
-) -> None:  # fmt: skip
+    agent: "Agent", name: str, starts: Tensor, beta: float, metrics: dict[str, Tensor], look: bool
+) -> None:
     """An actor dreams on from starts (N, D), learns from its dream, and so do its critic and the
     MDN: Eq. (7) for the stochastic actor, its first term alone for the deterministic one."""
-    actor, critic = agent.actors[name], agent.critics[name]
+    s, actor, critic = agent.s, agent.actors[name], agent.critics[name]
     with_entropy = name == "stochastic" and s.entropy
     with agent.autocast():
-        dream = agent.model.imagine(starts, dreaming(agent, name, s), s.horizon)
+        dream = agent.model.imagine(starts, dreaming(agent, name), s.horizon)
         returns = imagined_returns(dream, critic, s.gamma, s.lam)
         terms = {"return": actor_loss(returns, dream.continues, s.first_state_only)}
         if with_entropy:
@@ -276,10 +277,10 @@ def update_actor(
         agent.step("mdn", loss, metrics, len(starts))
 
 
-def dreaming(agent: "Agent", name: str, s: Settings) -> Callable[[Tensor], Tensor]:
+def dreaming(agent: "Agent", name: str) -> Callable[[Tensor], Tensor]:
     """What an actor does in its dreams, states (N, D) to actions (N, A): its action plus
     `dream_noise`; with `detach_policy` no gradient goes back into the states that it sees."""
-    actor = agent.actors[name]
+    s, actor = agent.s, agent.actors[name]
 
     def policy(state: Tensor) -> Tensor:
         action = actor(state.detach() if s.detach_policy else state)
@@ -320,7 +321,7 @@ def train(run: "Run", stop: Callable[[], bool]) -> None:
             rows = replay.sample(s.batch_size // processes(), s.length, run.rng)
             batch, beta = to_tensors(rows, agent.device), beta_at(run.step, s)
             began = time.monotonic()
-            metrics = update(agent, batch, beta, s, look=run.updates % 50 == 0)
+            metrics = update(agent, batch, beta, look=run.updates % 50 == 0)
             metrics |= {"beta": beta, "update_seconds": time.monotonic() - began}
             run.note_update(metrics)
         elif run.evaluation_due():
@@ -389,7 +390,8 @@ def interval95(returns: np.ndarray) -> float:
     """Half the width of the mean's 95% t-interval (§5); nan for a single return."""
     if len(returns) < 2:
         return float("nan")
-    return float(stats.t.ppf(0.975, len(returns) - 1) * stats.sem(returns))
+    quantile = stdtrit(len(returns) - 1, 0.975)  # of Student's t
+    return float(quantile * np.std(returns, ddof=1) / math.sqrt(len(returns)))
 
 
 class Agent(nn.Module):
@@ -558,14 +560,20 @@ class Run:
         self.seconds, self.clock = 0.0, time.monotonic()  # taken until the last checkpoint; then
         self.saved_rows = 0  # of the replay, then
         precision = "bfloat16" if self.agent.bfloat16 else "float32"
-        self.machine = f"{self.agent.device}, {precision}, {torch.get_num_threads()} threads, "
-        self.machine += f"torch {torch.__version__}"
+        on_cuda = self.agent.device.type == "cuda"
+        chip = torch.cuda.get_device_name() if on_cuda else torch.backends.cpu.get_cpu_capability()
+        self.machine = f"{self.agent.device} ({chip}), {precision}, {torch.get_num_threads()} "
+        self.machine += f"threads, torch {torch.__version__}"
         self.machine += f", {processes()} processes" if processes() > 1 else ""
         self.bar = self.writer = None  # open while `train` runs
 
+    @property
+    def own(self) -> Path:
+        """This process's folder in the run's."""
+        return self.folder / f"rank-{rank()}" if rank() else self.folder
+
     def open(self) -> None:
         """Take the folder, and its replay, for this process alone; a ValueError if another has."""
-        self.own = self.folder / f"rank-{rank()}" if rank() else self.folder
         self.own.mkdir(exist_ok=True)
         owner = self.folder / "run.owner"
         try:
@@ -707,7 +715,10 @@ class Run:
                              f"{', '.join(CHANGEABLE)}.")  # fmt: skip
         vars(self).update(saved["kept"])
         self.replay.restore(self.saved_rows, saved["checksums"].numpy())
-        self.agent.load_state_dict(saved["agent"])
+        try:
+            self.agent.load_state_dict(saved["agent"])
+        except RuntimeError:
+            raise ValueError(f"{path} is of another version's networks.") from None
         for name, optimiser in self.agent.optimisers.items():
             now_set = optimiser.state_dict()["param_groups"]  # the rate may have changed since
             optimiser.load_state_dict(saved["optimisers"][name] | {"param_groups": now_set})
@@ -724,11 +735,13 @@ class Run:
             self.retrace()
         torch.set_rng_state(saved["torch_random"])
         if self.agent.device.type == "cuda":
-            torch.cuda.set_rng_state_all(saved["cuda_random"])
+            states = saved["cuda_random"][: torch.cuda.device_count()]  # there may be fewer now
+            torch.cuda.set_rng_state_all(states)
         for name in CHANGEABLE:
             if now[name] != made[name]:
                 since = f"{name}: {now[name]} instead of {made[name]} from step {self.step:,} on"
-                say(since + ("; β now falls to its end by then." if name == "steps" else "."))
+                falls = name == "steps" and self.s.entropy
+                say(since + ("; β now falls to its end by then." if falls else "."))
 
     def retrace(self) -> None:
         """Take the actions of the episode under way again: its environment is then where it was."""
@@ -829,9 +842,8 @@ def has_bfloat16(device: torch.device) -> bool:
 def convolution_seconds(dtype: torch.dtype) -> float:
     """The least that one of the encoder's takes on this CPU."""
     x, weight = torch.ones(50, 16, 31, 31, dtype=dtype), torch.ones(32, 16, 4, 4, dtype=dtype)
-    given = {"f": nn.functional.conv2d, "x": x, "weight": weight}
-    timer = benchmark.Timer("f(x, weight, stride=2)", globals=given)
-    return min(timer.blocked_autorange(min_run_time=0.1).times)
+    timer = timeit.Timer(lambda: nn.functional.conv2d(x, weight, stride=2))
+    return min(timer.repeat(repeat=10, number=1))
 
 
 @dataclass(frozen=True)
@@ -879,7 +891,7 @@ def check(text: str, where: str = "") -> Settings:
         for name in wrong["loc"]:  # none, if it is no JSON
             where += f"--{name.replace('_', '-')} is {wrong['input']}: "
         raise ValueError(f"{where}{wrong['msg']}.") from None
-    n, least = processes(), s.prefill + s.train_every
+    n, least = processes(), -(-s.prefill // s.train_every) * s.train_every  # the first that is due
     rows = s.prefill // s.action_repeat // n
     live = s.starts * s.batch_size * ((s.length - s.burn_in) // 2) / n  # that are no ends, at least
     enough = s.density != "knn" or live >= 4
@@ -953,6 +965,9 @@ def resumed_run(command: Command) -> Run:
         raise ValueError("--resume keeps the run's own run_dir: leave out --run-dir.")
     s, folder = check(command.settings.to_json()), folder_named(command.resume)
     run = Run(s, folder, command.device, command.precision)
+    if not any((run.own / name).exists() for name in CHECKPOINTS):
+        whose = f" of {processes()} processes" if rank() else ""
+        raise ValueError(f"{folder} holds no whole checkpoint{whose}: it cannot go on.")
     run.open()
     run.load()
     run.sign()
@@ -973,17 +988,18 @@ def main(arguments: list[str]) -> int:
             sys.stdout = open(os.devnull, "w")  # the first speaks for all
         command = parse(arguments)
         restarted = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"
-        if restarted and Path(command.run_dir or "/", "settings.json").exists():
+        begun = folder_named(command.run_dir) / "settings.json"
+        if restarted and command.run_dir and begun.exists():
             command = dataclasses.replace(command, resume=command.run_dir, run_dir="")
         run = new_run(command) if command.resume is None else resumed_run(command)
     except (ValueError, OSError, MemoryError) as error:
         say(error)
         return 2
     with run.lock, run.replay.file:
-        return train_run(run)
+        return train_run(run, command.device, command.precision)
 
 
-def train_run(run: Run) -> int:
+def train_run(run: Run, device: str, precision: str) -> int:
     """Trains to the end, to a signal or to a fault, and says what to do next: the exit code."""
     s, stopped = run.s, threading.Event()
 
@@ -1000,7 +1016,10 @@ def train_run(run: Run) -> int:
           f"some {disk:.1f} GB of disk", flush=True)  # fmt: skip
     launcher = ["torchrun", "--nproc-per-node", os.environ.get("LOCAL_WORLD_SIZE", "1")]
     launcher = launcher if dist.is_initialized() else [sys.executable]
-    resume = "Go on with: " + shlex.join([*launcher, __file__, "--resume", str(run.folder)])
+    chosen = {"--device": device, "--precision": precision}  # which settings.json does not hold
+    chosen = [word for option in chosen.items() if option[1] != "auto" for word in option]
+    resume = [*launcher, __file__, "--resume", str(run.folder), *chosen]
+    resume = "Go on with: " + shlex.join(resume)
     every = 0.5 if sys.stderr.isatty() else 30  # seconds between two lines of a log file
     try:
         bar = tqdm(
@@ -1035,7 +1054,7 @@ def explained(error: Exception, run: Run) -> str:
         return str(error)
     if isinstance(error, OSError):
         return f"{error}: stopped; what was saved before is whole."
-    if isinstance(error, MemoryError) or "alloc" in str(error):
+    if isinstance(error, MemoryError) or "alloc" in str(error).lower():
         size = f"--batch-size {run.s.batch_size} and --length {run.s.length}"
         return f"No memory for an update of {size}: {reason}"
     if dist.is_initialized() and re.search("gloo|NCCL", str(error)):

@@ -63,7 +63,7 @@ def learn(command: argparse.Namespace, settings: list[str]) -> None:
         with torch.no_grad(), agent.autocast():
             seen = agent.model.observe(batch["image"], batch["action"], batch["is_first"])
         starts = train.dream_starts(seen.state, train.live_rows(agent, batch), s.starts)
-        train.update_actor(agent, name, starts, s.beta_start, s, metrics := {}, updates % 50 == 1)
+        train.update_actor(agent, name, starts, s.beta_start, metrics := {}, updates % 50 == 1)
         promised.append(train.as_numbers(metrics)[f"{name}_actor/return"])
         agent.follow()
         if updates % command.every == 0:

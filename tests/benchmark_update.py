@@ -121,17 +121,17 @@ def test_update(device, arm, preset, benchmark, capsys, monkeypatch):
     agent = TimedAgent(s, 3, where, bfloat16=has_bfloat16(where))
     batch = {name: x.to(where) for name, x in random_batch(s.batch_size, s.length, 3).items()}
     agent.seconds, agent.clock = defaultdict(float), clock()
-    update(agent, batch, 0.1, s)
+    update(agent, batch, 0.1)
     # Counted in PyTorch's form of the transposed convolutions: ours pads, and would count more.
     with monkeypatch.context() as patch, FlopCounterMode(display=False) as counter:
         patch.setattr(TransposedConv2d, "forward", torch.nn.ConvTranspose2d.forward)
-        update(agent, batch, 0.1, s)
+        update(agent, batch, 0.1)
     agent.seconds.clear()
     peak = PeakMemory(where)
 
     def timed() -> None:
         agent.clock = clock()
-        update(agent, batch, 0.1, s)
+        update(agent, batch, 0.1)
 
     rounds = 20 if preset == "small" else 3
     benchmark.pedantic(timed, rounds=rounds)
@@ -161,7 +161,7 @@ def process(rank: int, processes: int, threads: int, preset: str, folder: Path) 
     batch, seconds = random_batch(s.batch_size // processes, s.length, 3), []
     for _ in range(22 if preset == "small" else 5):
         began = clock()
-        update(agent, batch, 0.1, s)
+        update(agent, batch, 0.1)
         seconds.append(clock() - began)
     if rank == 0:
         np.savetxt(folder / "seconds", seconds[2:])

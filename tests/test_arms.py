@@ -138,7 +138,7 @@ def changed(before, after) -> set[str]:
 def updated(s: Settings, beta=0.1, bfloat16=False) -> tuple[Agent, dict[str, float]]:
     agent = make_agent(s, bfloat16)
     torch.manual_seed(1)
-    return agent, update(agent, make_batch(s), beta, s)
+    return agent, update(agent, make_batch(s), beta)
 
 
 def watched_update(s: Settings, watch, bfloat16=False) -> dict[str, float]:
@@ -147,7 +147,7 @@ def watched_update(s: Settings, watch, bfloat16=False) -> dict[str, float]:
     torch.manual_seed(1)
     step = agent.step
     agent.step = lambda name, *rest: watch(agent, name, rest[0], lambda: step(name, *rest))
-    return update(agent, make_batch(s), 0.1, s)
+    return update(agent, make_batch(s), 0.1)
 
 
 # --- settings ---
@@ -364,7 +364,7 @@ def test_the_benchmark_times_each_part_of_an_update():
     s = tiny("maxent")
     agent = TimedAgent(s, ACTIONS, torch.device("cpu"), bfloat16=False)
     agent.seconds, agent.clock = defaultdict(float), clock()
-    update(agent, make_batch(s), 0.1, s)
+    update(agent, make_batch(s), 0.1)
     assert agent.seconds.keys() == set(PARTS.values()) and min(agent.seconds.values()) > 0
 
 
@@ -405,7 +405,7 @@ def test_the_online_mdn_learns_and_the_target_mdn_rewards():
         for p in networks(agent)[perturbed].parameters() if perturbed else ():
             p.data += 0.1
         torch.manual_seed(1)
-        return update(agent, make_batch(s), 0.1, s)
+        return update(agent, make_batch(s), 0.1)
 
     plain, online, target = metrics(None), metrics("mdn"), metrics("target_mdn")
     assert online["mdn/entropy"] == plain["mdn/entropy"] != target["mdn/entropy"]
@@ -432,7 +432,7 @@ def test_terminal_states_start_no_dream():
     loss, imagine = agent.model.loss, agent.model.imagine
     agent.model.loss = lambda batch: starts.append(loss(batch)) or starts[-1]
     agent.model.imagine = lambda start, *rest: starts.append(start) or imagine(start, *rest)
-    update(agent, batch, 0.1, s)
+    update(agent, batch, 0.1)
     (_, states), *starts = starts
     assert len(starts) == 2
     for start in starts:
@@ -458,7 +458,7 @@ def test_dreamt_actions_are_noisy_and_stay_in_range(arm):
         agent.model.imagine = lambda *given, imagine=imagine, dreams=dreams: (
             dreams.append(imagine(*given)) or dreams[-1]
         )
-        update(agent, make_batch(s), 0.1, s)
+        update(agent, make_batch(s), 0.1)
         for meant, dream in zip(asked.values(), dreams, strict=True):
             for taken, action in zip(dream.action.detach(), meant[: s.horizon + 1], strict=True):
                 added = (taken - action).flatten().numpy()
@@ -471,7 +471,7 @@ def test_a_share_of_the_images_is_decoded_as_the_settings_say():
     agent, decoded = make_agent(s), []
     nll = agent.model.decoder.nll
     agent.model.decoder.nll = lambda z, image: decoded.append(len(z)) or nll(z, image)
-    update(agent, make_batch(s), 0.1, s)
+    update(agent, make_batch(s), 0.1)
     assert decoded == [s.batch_size * s.length // 2]
 
 
@@ -513,7 +513,7 @@ def test_an_infinite_loss_of_finite_gradient_is_refused():
     row = (~batch["is_first"]).nonzero()[0].tolist()
     batch["reward"][tuple(row)] = math.inf
     with pytest.raises(FloatingPointError, match="model"):
-        update(agent, batch, 0.1, s)
+        update(agent, batch, 0.1)
 
 
 def test_a_reward_that_is_not_a_number_stops_the_update_before_anything_moves():
@@ -522,7 +522,7 @@ def test_a_reward_that_is_not_a_number_stops_the_update_before_anything_moves():
     batch["reward"][:] = math.nan
     before = all_state(agent)
     with pytest.raises(FloatingPointError, match="Not finite: model/reward"):
-        update(agent, batch, 0.1, s)
+        update(agent, batch, 0.1)
     assert all(torch.equal(a, b) for a, b in zip(before, all_state(agent), strict=True))
 
 
@@ -533,7 +533,7 @@ def test_a_model_that_knows_no_numbers_any_more_stops_the_update_and_nothing_mov
     agent.model.gru.weight_hh.data.fill_(math.nan)
     before = all_state(agent)
     with pytest.raises(FloatingPointError, match=r"Not finite: model/image, .*model/grad_norm"):
-        update(agent, batch, 0.1, s)
+        update(agent, batch, 0.1)
     pairs = zip(before, all_state(agent), strict=True)
     assert all(torch.equal(a, b) or a.isnan().all() for a, b in pairs)
 
@@ -547,7 +547,7 @@ def test_half_of_the_live_states_are_drawn_anew_for_each_dream():
     imagine = agent.model.imagine
     agent.model.imagine = lambda start, *rest: starts.append(start) or imagine(start, *rest)
     for _ in range(2):
-        update(agent, batch, 0.1, s)
+        update(agent, batch, 0.1)
     live = int((~batch["terminated"]).sum())
     assert [len(start) for start in starts] == 2 * [round(live / 2)]
     assert len(starts[0].unique(dim=0)) == len(starts[0])  # none twice
@@ -574,7 +574,7 @@ def test_action_penalty_draws_saturated_actions_back(name):
     state = torch.zeros(1, agent.model.size)
     before = actor.raw(state).detach()
     assert (before > 30).all()
-    update(agent, batch, 0.1, s)
+    update(agent, batch, 0.1)
     assert (actor.raw(state) < before).all()
 
 
@@ -637,7 +637,7 @@ def test_both_gradients_of_the_objective_are_measured_when_asked():
     s = tiny("maxent")
     agent = make_agent(s)
     torch.manual_seed(1)
-    looked = update(agent, make_batch(s), 0.1, s, look=True)
+    looked = update(agent, make_batch(s), 0.1, look=True)
     _, plain = updated(s)
     apart = {f"stochastic_actor/{term}_grad_norm" for term in ("return", "entropy")}
     assert looked.keys() - plain.keys() == apart

@@ -60,11 +60,11 @@ def test_an_update_waits_for_the_device_at_its_start_and_at_its_end_alone(densit
     s = tiny("maxent", density=density, **switches)
     agent = Agent(s, 2, CUDA, bfloat16=True)
     batch = {name: value.to(CUDA) for name, value in make_batch(s).items()}
-    update(agent, batch, 0.1, s)
+    update(agent, batch, 0.1)
     with warnings.catch_warnings(record=True, action="always") as warned:
         torch.cuda.set_sync_debug_mode("warn")
         try:
-            update(agent, batch, 0.1, s, look=True)
+            update(agent, batch, 0.1, look=True)
         finally:
             torch.cuda.set_sync_debug_mode("default")
     said = [str(each.message) for each in warned]

@@ -82,7 +82,7 @@ def gradients(batch: dict[str, torch.Tensor], s: Settings) -> dict[str, object]:
             "torch.distributions.normal._standard_normal",
             lambda shape, **_: torch.full(shape, 0.3),
         )
-        found["metrics"] = update(agent, batch, 0.1, s, look=True)
+        found["metrics"] = update(agent, batch, 0.1, look=True)
     return found
 
 
@@ -119,7 +119,7 @@ def keep_weights(rank: int, folder: Path) -> None:
     for number in range(50):
         batch = shard(2 * number + rank)
         batch["terminated"][0, number % LENGTH] = rank == 0
-        update(agent, batch, 0.1, s, look=number % 10 == 0)
+        update(agent, batch, 0.1, look=number % 10 == 0)
     torch.save((agent.state_dict(), torch.rand(1)), folder / f"weights.{rank}")
 
 
@@ -132,7 +132,7 @@ def meet_infinity(rank: int, folder: Path) -> None:
     batch["reward"][0, LENGTH // 2] = math.inf if rank == 0 else 0.0
     batch["is_first"][0, LENGTH // 2] = False
     with pytest.raises(FloatingPointError) as stopped:
-        update(agent, batch, 0.1, s)
+        update(agent, batch, 0.1)
     loss = sum(p.sum() for p in agent.model.parameters())  # what `masked_mean` does not share
     agent.step("model", loss + (math.inf if rank == 0 else 0.0), alone := {})
     same = all(torch.equal(a, b) for a, b in zip(before, agent.model.parameters(), strict=True))
@@ -145,12 +145,12 @@ def outlive(rank: int, folder: Path) -> None:
     s = tiny("maxent")
     agent = make_agent(s)
     if rank == 1:
-        update(agent, shard(rank), 0.1, s)
+        update(agent, shard(rank), 0.1)
         os._exit(9)
     began = time.monotonic()
     with pytest.raises(RuntimeError) as ended:
         for _ in range(100):
-            update(agent, shard(rank), 0.1, s)
+            update(agent, shard(rank), 0.1)
     assert "gloo" in str(ended.value)
     (folder / "seconds").write_text(str(time.monotonic() - began))
 
@@ -221,7 +221,7 @@ def test_an_update_of_one_process_is_the_same_bit_for_bit_with_and_without_torch
     def after() -> tuple[dict, dict]:
         agent = make_agent(s)
         torch.manual_seed(1)
-        return update(agent, make_batch(s), 0.1, s, look=True), agent.state_dict()
+        return update(agent, make_batch(s), 0.1, look=True), agent.state_dict()
 
     s = tiny(arm, starts=0.5)
     metrics, weights = after()

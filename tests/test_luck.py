@@ -414,9 +414,12 @@ def test_a_run_stopped_anywhere_goes_on_by_its_own_advice_as_if_it_had_not(
     monkeypatch.setattr(Signalled, "which", which)
     monkeypatch.setattr(Signalled, "number_sent", number)
     env = register(Signalled)
-    assert train.main(["--env", env, f"--run-dir={name}", *FAST]) == 0
+    own = "bfloat16" if train.has_bfloat16(torch.device("cpu")) else "float32"
+    precision = [] if which == 1 else ["--precision", own]  # in no settings.json
+    assert train.main(["--env", env, f"--run-dir={name}", *precision, *FAST]) == 0
     assert Path.cwd() == Path("/")
     advice = shlex.split(capfd.readouterr().out.split("Go on with: ")[1])
+    assert advice[4:] == precision
     assert Path(advice[0]) == Path(sys.executable) and Path(advice[1]) == Path(train.__file__)
     assert train.main(advice[2:]) == 0
     assert "Done" in capfd.readouterr().out
@@ -628,11 +631,19 @@ def test_damaged_metrics_stop_nothing_and_later_rows_are_whole(damage, stub_run)
 
 
 def test_a_run_without_checkpoints_is_refused_and_left_as_it_is(stub_run, capsys):
-    for name in train.CHECKPOINTS:
-        (stub_run / name).unlink()
+    for name in (*train.CHECKPOINTS, "replay.bin", "run.lock"):
+        (stub_run / name).unlink(missing_ok=True)
     before = contents(stub_run)
     refused(["--resume", stub_run, "--steps", "180"], capsys, "no whole checkpoint")
     assert contents(stub_run) == before
+
+
+def test_a_checkpoint_of_other_networks_is_refused(stub_run, capsys):
+    path = stub_run / "checkpoint.pt"
+    saved = torch.load(path, weights_only=True)
+    saved["agent"].popitem()
+    torch.save(saved, path)
+    refused(["--resume", stub_run, "--steps", "180"], capsys, "another version's networks")
 
 
 def test_a_lost_row_of_metrics_comes_back_with_the_next(stub_run):

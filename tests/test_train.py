@@ -435,6 +435,7 @@ BAD = {
     "--model-lr inf": "--model-lr",
     "--seed 99999999999999999999": "--seed",
     "--steps 100": "--prefill",
+    "--preset paper --steps 4999": "give 5000",  # where the first hundred updates are due
     "--arm": "--arm",
     "--resume": "--resume",
     "--run-dir /dev/null/run": "/dev/null",
