@@ -80,7 +80,7 @@ class Settings:
     eval_every: Count = 5_000  # environment steps between evaluations, once training began (ours)
     eval_episodes: Size = 10  # episodes an evaluation (§5: 10)
     eval_max_steps: Count = 10_000  # environment steps after which one of them is ended (ours)
-    checkpoint_minutes: Amount = 5.0  # at most, between two checkpoints (ours)
+    checkpoint_minutes: Amount = 5.0  # between two checkpoints; 500 decisions make one too (ours)
     replay_capacity: Count = 500_000  # rows (decisions) of experience kept (ours)
     action_repeat: Size = 2  # environment steps a decision (Dreamer)
     camera_distance: Amount = 1.7  # metres to a PyBullet robot; 3 is the environment's own (ours)
@@ -707,7 +707,8 @@ class Run:
 
     def load(self) -> None:
         """Go back to the newest whole checkpoint, and say what is not as it was. A ValueError if
-        there is none, the replay is not its own, or what may not change differs."""
+        there is none, the replay is not its own, what may not change differs, or the networks are
+        another version's."""
         path, saved = read_checkpoint(self.own)
         made, now, here = json.loads(saved["settings"]), dataclasses.asdict(self.s), self.machine
         if fixed := fixed_changes(made, now):
@@ -843,7 +844,7 @@ def convolution_seconds(dtype: torch.dtype) -> float:
     """The least that one of the encoder's takes on this CPU."""
     x, weight = torch.ones(50, 16, 31, 31, dtype=dtype), torch.ones(32, 16, 4, 4, dtype=dtype)
     timer = timeit.Timer(lambda: nn.functional.conv2d(x, weight, stride=2))
-    return min(timer.repeat(repeat=10, number=1))
+    return min(timer.repeat(repeat=20, number=2)) / 2
 
 
 @dataclass(frozen=True)
@@ -988,9 +989,9 @@ def main(arguments: list[str]) -> int:
             sys.stdout = open(os.devnull, "w")  # the first speaks for all
         command = parse(arguments)
         restarted = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"
-        begun = folder_named(command.run_dir) / "settings.json"
-        if restarted and command.run_dir and begun.exists():
-            command = dataclasses.replace(command, resume=command.run_dir, run_dir="")
+        if restarted and command.run_dir:
+            if (folder_named(command.run_dir) / "settings.json").exists():
+                command = dataclasses.replace(command, resume=command.run_dir, run_dir="")
         run = new_run(command) if command.resume is None else resumed_run(command)
     except (ValueError, OSError, MemoryError) as error:
         say(error)

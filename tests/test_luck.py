@@ -638,6 +638,12 @@ def test_a_run_without_checkpoints_is_refused_and_left_as_it_is(stub_run, capsys
     assert contents(stub_run) == before
 
 
+def test_a_run_that_goes_on_on_another_processor_says_so(stub_run, monkeypatch, capsys):
+    monkeypatch.setattr("torch.backends.cpu.get_cpu_capability", lambda: "another")
+    assert train.main(["--resume", str(stub_run), "--steps", "180", "--device", "cpu"]) == 0
+    assert "(another)" in capsys.readouterr().err
+
+
 def test_a_checkpoint_of_other_networks_is_refused(stub_run, capsys):
     path = stub_run / "checkpoint.pt"
     saved = torch.load(path, weights_only=True)

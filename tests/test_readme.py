@@ -55,9 +55,19 @@ def test_the_table_of_speed_is_what_the_benchmark_printed():
 
 
 def test_links_lead_somewhere():
-    for page in (ROOT / "README.md", ROOT / "results" / "README.md"):
-        for link in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
-            assert link.startswith("http") or (page.parent / link).exists(), link
+    for page in (ROOT / "README.md", *(ROOT / "results" / n for n in ("README.md", "trials.md"))):
+        for link in re.findall(r"\]\(([^)]+)\)", page.read_text()):
+            if not link.startswith("http"):
+                file, _, anchor = link.partition("#")
+                target = page.parent / file if file else page
+                assert target.exists(), link
+                assert not anchor or anchor in anchors(target.read_text()), link
+
+
+def anchors(page: str) -> list[str]:
+    """What a link may name on a page: its headings, as GitHub writes them."""
+    headings = re.findall(r"^#+ (.*)", page, re.MULTILINE)
+    return [re.sub(r"[^\w\- ]", "", name.lower()).replace(" ", "-") for name in headings]
 
 
 def test_the_readme_is_short():
