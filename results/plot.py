@@ -136,19 +136,21 @@ def draw_env(panels, env: str, arms, reference, colors) -> None:
     """The column of panels of an environment."""
     above, below, against = panels
     above.sharex(below)
+    runs = [run for of in arms.values() for run in of.values()]
     earned = {p: float(reference[env, p]["return"]) for p in POLICIES if (env, p) in reference}
     for policy, value in earned.items():
         above.axhline(value, color="grey", linestyle=POLICIES[policy], label=f"{policy} actions")
     for axes, column in ((above, "eval_return"), (below, "coverage")):
         for name, of in arms.items():
             draw_curve(axes, of, column, name, colors[name])
-        values = np.concatenate([run[column] for of in arms.values() for run in of.values()])
+        values = np.concatenate([run[column] for run in runs])
         values = [*values[np.isfinite(values)], *(earned.values() if axes is above else ())]
         if values:  # an interval over two runs may leave the panel
             margin = 0.1 * np.ptp(values) + 1
             axes.set_ylim(min(values) - margin, max(values) + margin)
     for name, of in arms.items():
         draw_against(against, of, name, colors[name])
+    against.set_visible(any("mdn/entropy" in run for run in runs))
     above.set(title=env, ylabel="evaluation return")
     below.set(xlabel="environment steps", ylabel="coverage of states, nats")
     against.set(xlabel="Ĥ of states to come, nats", ylabel="coverage of states, nats")
@@ -167,7 +169,7 @@ def draw(path: Path, runs, reference) -> None:
     panels = figure.subplots(3, len(runs), squeeze=False)
     for (env, arms), column in zip(sorted(runs.items()), panels.T, strict=True):
         draw_env(column, env, arms, reference, colors)
-    figure.savefig(path, dpi=90, metadata={"Software": None})
+    figure.savefig(path, dpi=90, bbox_inches="tight", metadata={"Software": None})
 
 
 def score(run: dict, end: float) -> float:
