@@ -158,8 +158,8 @@ ARMS = {  # what each curve of the paper's figure changes in `Settings`, whose o
 }
 PRESETS = {
     "small": dict(  # sizes and cadence for two CPU cores, and what results/trials.md found to help
-        deter=128, stoch=64, hidden=128, units=128, depth=16, batch_size=10, length=25,
-        mdn_units=128, prefill=2000, train_every=6, updates=1, starts=0.25, floor_brightness=0.4,
+        deter=128, stoch=64, hidden=128, units=128, depth=16, batch_size=20, length=25,
+        mdn_units=128, prefill=2000, train_every=10, updates=1, starts=0.25, floor_brightness=0.4,
         reward_weight=20.0, squared_reward=True, smooth_l1=False, ends_ahead=5, burn_in=2,
         action_penalty=0.01, critic_lr=5e-4, critic_norm=True, actor_lr=2e-4, horizon=5,
         play_rate=0.01, decode_share=0.25, dream_noise=0.3, collect="both", action_noise=0.3,
