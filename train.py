@@ -716,10 +716,7 @@ class Run:
                              f"{', '.join(CHANGEABLE)}.")  # fmt: skip
         vars(self).update(saved["kept"])
         self.replay.restore(self.saved_rows, saved["checksums"].numpy())
-        try:
-            self.agent.load_state_dict(saved["agent"])
-        except RuntimeError:
-            raise ValueError(f"{path} is of another version's networks.") from None
+        take(self.agent, saved["agent"])
         for name, optimiser in self.agent.optimisers.items():
             now_set = optimiser.state_dict()["param_groups"]  # the rate may have changed since
             optimiser.load_state_dict(saved["optimisers"][name] | {"param_groups": now_set})
@@ -807,6 +804,15 @@ def whole_checkpoints(folder: Path) -> Iterator[tuple[tuple, Path, dict]]:
                         continue
             say(f"{path} is damaged: looking for the one before it.")
     raise ValueError(f"{folder} holds no whole checkpoint: start a new run in another folder.")
+
+
+def take(networks: nn.Module, weights: dict[str, Tensor]) -> None:
+    """Load what was saved. A ValueError, in one sentence, if it is of other networks."""
+    try:
+        networks.load_state_dict(weights)
+    except RuntimeError as error:
+        why = " ".join(str(error).split())
+        raise ValueError(f"It is of other settings' or another version's networks: {why}") from None
 
 
 def make_agent(s: Settings, env, device: str = "auto", precision: str = "auto") -> Agent:
@@ -1017,10 +1023,9 @@ def train_run(run: Run, device: str, precision: str) -> int:
           f"some {disk:.1f} GB of disk", flush=True)  # fmt: skip
     launcher = ["torchrun", "--nproc-per-node", os.environ.get("LOCAL_WORLD_SIZE", "1")]
     launcher = launcher if dist.is_initialized() else [sys.executable]
-    chosen = {"--device": device, "--precision": precision}  # which settings.json does not hold
-    chosen = [word for option in chosen.items() if option[1] != "auto" for word in option]
-    resume = [*launcher, __file__, "--resume", str(run.folder), *chosen]
-    resume = "Go on with: " + shlex.join(resume)
+    options = {"--resume": str(run.folder), "--device": device, "--precision": precision}
+    given = [word for option in options.items() if option[1] != "auto" for word in option]
+    resume = "Go on with: " + shlex.join([*launcher, __file__, *given])
     every = 0.5 if sys.stderr.isatty() else 30  # seconds between two lines of a log file
     try:
         bar = tqdm(

@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import train
 from actors import play
 from env import Replay, make_env
-from results.play import ACTORS, exit_code, take
+from results.play import ACTORS, exit_code
 
 EXPERIENCE = (  # settings of what was seen, which only the run itself could change
     "env", "action_repeat", "camera_distance", "floor_brightness", "replay_capacity",
@@ -40,7 +40,7 @@ def frozen(folder: Path, like: train.Command, seed: int) -> tuple[gym.Env, train
     torch.manual_seed(seed)
     agent = train.make_agent(s, env, like.device, like.precision)
     of_model = (item for item in saved["agent"].items() if item[0].startswith("model."))
-    take(agent.model, {name.removeprefix("model."): x for name, x in of_model})
+    train.take(agent.model, {name.removeprefix("model."): x for name, x in of_model})
     replay = Replay(s.replay_capacity, env.action_space.shape[0], folder / "replay.bin")
     replay.restore(saved["kept"]["saved_rows"], saved["checksums"].numpy())
     return env, agent, replay

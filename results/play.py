@@ -43,16 +43,8 @@ def load(folder: Path, checkpoint: str, device: str, precision: str):
             raise ValueError(f"{folder} was not evaluated yet: it has no best.pt.") from None
         except Exception as error:  # damage has many
             raise ValueError(f"{path} is damaged: {type(error).__name__}.") from None
-    take(agent, weights)
+    train.take(agent, weights)
     return s, env, agent, name
-
-
-def take(networks: torch.nn.Module, weights: dict[str, torch.Tensor]) -> None:
-    """Load what was saved. A ValueError, in one sentence, if it is of other networks."""
-    try:
-        networks.load_state_dict(weights)
-    except RuntimeError as error:
-        raise ValueError(f"Other networks were saved: {' '.join(str(error).split())}") from None
 
 
 @torch.no_grad()
