@@ -29,9 +29,9 @@ class StochasticActor(nn.Module):
     σ is near 5 at first: the untrained policy plays all actions, mostly the extreme ones.
     """
 
-    def __init__(self, size: int, actions: int, units: int, layers: int = 4):
+    def __init__(self, size: int, actions: int, units: int):
         super().__init__()
-        self.net = mlp(size, units, layers, 2 * actions)
+        self.net = mlp(size, units, 4, 2 * actions)  # 4 hidden layers, as Dreamer's
 
     def raw(self, state: Tensor) -> Tensor:
         """x, what the bounds act on: (…, D) -> (…, A)."""
@@ -56,9 +56,9 @@ class StochasticActor(nn.Module):
 class DeterministicActor(nn.Module):
     """A(s) = tanh(5 tanh(x / 5)), trained beside the stochastic actor, evaluated for it (§4.1)."""
 
-    def __init__(self, size: int, actions: int, units: int, layers: int = 4):
+    def __init__(self, size: int, actions: int, units: int):
         super().__init__()
-        self.net = mlp(size, units, layers, actions)
+        self.net = mlp(size, units, 4, actions)
 
     def raw(self, state: Tensor) -> Tensor:
         """x, what the bounds act on: (…, D) -> (…, A)."""
@@ -74,9 +74,9 @@ class DeterministicActor(nn.Module):
 class QCritic(nn.Module):
     """Q(s, a) of the current policy, Eq. (2); minor modification 1 of §4.2."""
 
-    def __init__(self, size: int, actions: int, units: int, layers: int = 3, norm=False):
+    def __init__(self, size: int, actions: int, units: int, norm=False):
         super().__init__()
-        self.net = mlp(size + actions, units, layers, 1, norm)
+        self.net = mlp(size + actions, units, 3, 1, norm)  # 3 hidden layers, as Dreamer's
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """(…, D), (…, A) -> (…). At a ~ π(s): a one-sample estimate of V(s) = E_a Q(s, a)."""
@@ -86,9 +86,9 @@ class QCritic(nn.Module):
 class VCritic(nn.Module):
     """V(s) of the current policy, Eq. (1): the critic of the original Dreamer."""
 
-    def __init__(self, size: int, units: int, layers: int = 3, norm=False):
+    def __init__(self, size: int, units: int, norm=False):
         super().__init__()
-        self.net = mlp(size, units, layers, 1, norm)
+        self.net = mlp(size, units, 3, 1, norm)
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """(…, D), (…, A) -> (…). V ignores the action: either critic can stand in the loop."""
@@ -177,12 +177,12 @@ class Episode(NamedTuple):
     actions: np.ndarray  # (L, A) a_0 … a_{L−1}
     rewards: np.ndarray  # (L,) r_1 … r_L
     states: Tensor  # (L, D) s_0 … s_{L−1}
-    terminated: bool  # or cut off by a time limit
+    terminated: bool  # False: cut off, by a time limit or after `most` steps
     total: float  # sum of rewards
     length: int  # environment steps
 
 
-def play(agent, env, policy: Callable, seed: int, most: int = 10_000) -> Episode:
+def play(agent, env, policy: Callable, seed: int, most: int) -> Episode:
     """One episode of a policy, ended after `most` environment steps if it does not end before.
     Training's random numbers stay as they were."""
     image, _ = env.reset(seed=seed)

@@ -134,7 +134,9 @@ def set_up_pybullet(robot: gym.Env, camera_distance: float | None, floor_brightn
     # that resumes it.
     with silence():
         robot.reset(seed=0)
-    for i in range(robot._p.getNumBodies() if floor_brightness != 1.0 else 0):
+    if floor_brightness == 1.0:
+        return
+    for i in range(robot._p.getNumBodies()):
         body = robot._p.getBodyUniqueId(i)
         name = b" ".join(robot._p.getBodyInfo(body)).lower()
         if any(word in name for word in (b"floor", b"plane", b"stadium")):
@@ -252,7 +254,7 @@ class Foreign(gym.Wrapper, gym.utils.RecordConstructorArgs):
         return *result[:-1], info | {"state": state}
 
 
-def coverage(states: np.ndarray, k: int = 3) -> float:
+def coverage(states: np.ndarray) -> float:
     """Entropy of the distribution that visited states are samples of: exploration, measured.
 
     The Kozachenko-Leonenko (particle) estimate from the distance ε_i of each state to its k-th
@@ -260,17 +262,18 @@ def coverage(states: np.ndarray, k: int = 3) -> float:
 
         ψ(n) − ψ(k) + log V + d/n Σ_i log ε_i
 
-    It is consistent, but biased where n is small for d, so compare only equal n. ε is taken as
-    1e-6 at least: states that repeat exactly have no density.
+    It is consistent, but biased where n is small for d, so compare only equal n. k is 3: more
+    neighbours have less variance and more bias. ε is taken as 1e-6 at least: states that repeat
+    exactly have no density.
 
     Args:
         states: (n, d), in the environment's own units; of more than 5,000, as many evenly spaced.
-        k: neighbours; more have less variance and more bias.
 
     Returns:
         nats; nan for k states or fewer, if any is not finite, and for no dimensions or more than
         64, where the estimate means nothing and takes minutes.
     """
+    k = 3
     try:
         states = np.asarray(states, np.float64)
         n, d = states.shape
@@ -304,9 +307,9 @@ class Replay:
             ("terminated", np.bool_),
             ("is_first", np.bool_),
         ], align=True)  # fmt: skip
-        # The next checkpoint is due `unsaved` rows after the last; `restore` can go back two.
-        self.capacity, self.unsaved = capacity, min(500, capacity)
-        self.ring = capacity + 3 * self.unsaved
+        # A checkpoint is due every `save_every` rows; `restore` can go back two of them.
+        self.capacity, self.save_every = capacity, min(500, capacity)
+        self.ring = capacity + 3 * self.save_every
         self.checksums = np.zeros(self.ring, np.uint32)  # CRC-32 of each row
         self.added = 0  # rows ever added; row i lies at i % ring
         if path:

@@ -39,8 +39,10 @@ def lambda_return(
 
 
 def survival(continues: Tensor) -> Tensor:
-    """Probability S that the imagined episode has reached each state, without gradient: how much
-    what is imagined there counts (ours, where §4.2 has a termination model; Dreamer's code: Π γ).
+    """Probability S that an imagined episode has not ended before each state, without gradient.
+
+    Losses there are weighted by it. That is ours, and follows from §4.2's termination model;
+    Dreamer's code weights by Π γ.
 
         S_0 = 1;   S_k = c_1 c_2 … c_k
 

@@ -60,6 +60,7 @@ Size = Annotated[int, Interval(ge=1, le=10_000)]  # of a layer, batch or sequenc
 Count = Annotated[int, Interval(ge=1, le=10**9)]  # of steps or rows
 Whole = Annotated[int, Interval(ge=0, lt=2**63)]
 Share = Annotated[float, Interval(ge=0, le=1)]
+Rate = Annotated[Share, Interval(gt=0)]  # of a moving average: at 0 it would never move
 Amount = Annotated[float, Interval(ge=0, lt=float("inf"))]
 
 
@@ -76,13 +77,13 @@ class Settings:
     steps: Count = 100_000  # environment steps of the run, prefill included (ours)
     prefill: Whole = 5000  # environment steps of random actions before training (Dreamer: 5000)
     train_every: Count = 1000  # environment steps between two rounds of updates (Dreamer: 1000)
-    updates: Size = 100  # gradient updates a round (Dreamer: 100)
+    updates: Size = 100  # gradient updates per round (Dreamer: 100)
     eval_every: Count = 5_000  # environment steps between evaluations, once training began (ours)
-    eval_episodes: Size = 10  # episodes an evaluation (§5: 10)
+    eval_episodes: Size = 10  # episodes per evaluation (§5: 10)
     eval_max_steps: Count = 10_000  # environment steps after which one of them is ended (ours)
     checkpoint_minutes: Amount = 5.0  # between two checkpoints; 500 decisions make one too (ours)
     replay_capacity: Count = 500_000  # rows (decisions) of experience kept (ours)
-    action_repeat: Size = 2  # environment steps a decision (Dreamer)
+    action_repeat: Size = 2  # environment steps per decision (Dreamer)
     camera_distance: Amount = 1.7  # metres to a PyBullet robot; 3 is the environment's own (ours)
     floor_brightness: Share = 1.0  # factor on a PyBullet floor's texture; 1 is its own (ours)
 
@@ -105,24 +106,24 @@ class Settings:
     hidden: Size = 200  # units of the RSSM's dense layers (Dreamer: 200)
     units: Size = 400  # of reward, termination, actor and critic layers (Dreamer: 400)
     depth: Size = 32  # channels of the first convolution (Dreamer: 32)
-    batch_size: Size = 50  # sequences a batch (Dreamer: 50)
-    length: Annotated[Size, Interval(ge=2)] = 50  # rows a sequence (Dreamer: 50)
-    burn_in: Whole = 0  # rows of one begun mid-episode: no reward, end or dream is of them (ours)
+    batch_size: Size = 50  # sequences per batch (Dreamer: 50)
+    length: Annotated[Size, Interval(ge=2)] = 50  # rows per sequence (Dreamer: 50)
+    burn_in: Whole = 0  # first rows of one begun mid-episode: no reward, end or dream (ours)
     ends_ahead: Whole = 0  # steps of dreams in which ends are learnt too (ours)
     decode_share: Share = 1.0  # of a batch's images, those that are decoded (Dreamer: all)
     horizon: Size = 15  # imagined steps, and n of Eq. (10) (Dreamer)
     starts: Share = 1.0  # of a batch's live states, those that actors dream on from (Dreamer: all)
 
-    gamma: Share = 0.99  # γ of λ-returns, a decision (Dreamer)
+    gamma: Share = 0.99  # γ of λ-returns, per decision (Dreamer)
     lam: Share = 0.95  # λ of λ-returns (Dreamer)
     gamma_q: Share = 0.9  # γ of the discounted state distribution (§5)
     beta_start: Amount = 0.2  # entropy coefficient β at the first environment step (§5)
     beta_end: Amount = 0.0001  # and at the last, linear between (§5)
-    density: Literal["mdn", "knn"] = "mdn"  # whose entropy: §4.1's MDN, or of neighbours' distances
+    density: Literal["mdn", "knn"] = "mdn"  # entropy by §4.1's MDN, or by neighbours (ours)
     mdn_components: Size = 8  # components of the mixture density network (§5: heads)
     mdn_units: Size = 256  # its hidden units (§5: 256)
     mdn_min_std: Amount = 0.1  # floor under its σ (ours)
-    target_rate: Share = 0.1  # soft update of the target MDN (§5)
+    target_rate: Rate = 0.1  # soft update of the target MDN (§5)
     dream_noise: Amount = 0.0  # std of noise on imagined actions (ours)
     detach_policy: bool = True  # no gradient through what the policy sees in its dream (Dreamer)
     action_penalty: Amount = 0.0  # × Σ x², x an action before its bounds, lest it saturate (ours)
@@ -131,8 +132,8 @@ class Settings:
     critic_lr: Amount = 8e-5  # of each critic (Dreamer)
     critic_norm: bool = False  # LayerNorm in critics, whose values else may run away (ours)
     mdn_lr: Amount = 2e-4  # of the mixture density network (§5)
-    play_rate: Share = 1.0  # soft update of the actors that play; 1: those that learn (ours)
-    grad_clip: Amount = 100.0  # largest global gradient norm of an optimiser step (Dreamer)
+    play_rate: Rate = 1.0  # of the moving average of an actor, which plays; 1: itself (ours)
+    grad_clip: Annotated[Amount, Interval(gt=0)] = 100.0  # largest norm of a gradient (Dreamer)
     free_nats: Amount = 3.0  # KL below this costs nothing; of `kl` only (Dreamer)
     image_weight: Amount = 1.0  # weight of the image's loss (Dreamer)
     reward_weight: Amount = 1.0  # of the reward's loss (Dreamer)
@@ -321,11 +322,12 @@ def train(run: "Run", stop: Callable[[], bool]) -> None:
             rows = replay.sample(s.batch_size // processes(), s.length, run.rng)
             batch, beta = to_tensors(rows, agent.device), beta_at(run.step, s)
             began = time.monotonic()
-            metrics = update(agent, batch, beta, look=run.updates % 50 == 0)
+            look = run.updates % 50 == 0
+            metrics = update(agent, batch, beta, look)
             metrics |= {"beta": beta, "update_seconds": time.monotonic() - began}
-            run.note_update(metrics)
+            run.note_update(metrics, look)
         elif run.evaluation_due():
-            run.report(evaluate(agent, run.eval_env, s, run.bar.set_postfix_str))
+            run.report(evaluate(agent, run.eval_env, run.bar.set_postfix_str))
         elif run.step < s.steps:
             if run.over:
                 replay.add(run.begin_episode(), is_first=True)
@@ -354,8 +356,7 @@ def passed(before: int, after: int, every: int) -> int:
 
 
 def to_tensors(rows: np.ndarray, device: torch.device) -> dict[str, Tensor]:
-    """Records of the replay as one tensor a field, copied into memory of torch's own, so
-    that nothing depends on where the replay's arrays lie (not seen to matter: trials, P)."""
+    """Records of the replay as one tensor per field: copied, since the records are read-only."""
     return {name: torch.tensor(rows[name], device=device) for name in rows.dtype.names}
 
 
@@ -364,11 +365,11 @@ def beta_at(step: int, s: Settings) -> float:
     return s.beta_start + (s.beta_end - s.beta_start) * min(step / s.steps, 1.0)
 
 
-def evaluate(agent: "Agent", env, s: Settings, show=lambda text: None) -> list[tuple[float, int]]:
+def evaluate(agent: "Agent", env, show: Callable[[str], None]) -> list[tuple[float, int]]:
     """Return and length of this process's share of the episodes of the evaluated actor's greedy
     actions, each with a seed of its own, always the same. One in which the environment fails is
     left out."""
-    episodes = []
+    s, episodes = agent.s, []
     for k in range(rank(), s.eval_episodes, processes()):
         show(f"evaluating, episode {k + 1} of {s.eval_episodes}")
         seed = evaluation_seed(k)
@@ -445,9 +446,9 @@ class Agent(nn.Module):
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16)
 
     def step(self, name: str, loss: Tensor, metrics: dict[str, Tensor], count: int = 1) -> None:
-        """One step of the named optimiser on `loss`, this process's mean over `count` things. The
-        gradient's norm goes into `metrics`, not finite if it or the loss is not, in any process;
-        from the first such norm in them on, no step changes anything."""
+        """One step of the named optimiser on `loss`, the mean over this process's `count` things.
+        `metrics` get the gradient's norm, which is not finite if, in any process, it or the loss is
+        not. Once they hold such a norm, no later step of this update changes anything."""
         optimiser = self.optimisers[name]
         parameters = optimiser.param_groups[0]["params"]
         optimiser.zero_grad()
@@ -541,13 +542,13 @@ class Run:
 
     def __init__(self, s: Settings, folder: Path, device: str = "auto", precision: str = "auto"):
         self.s, self.folder = s, folder
-        view = s.camera_distance, s.floor_brightness
-        self.env, self.eval_env = (make_env(s.env, s.action_repeat, *view) for _ in range(2))
+        self.env, self.eval_env = make_env_of(s), make_env_of(s)
         torch.manual_seed(s.seed + 2**40 * rank())
         self.rng = np.random.default_rng(s.seed + 2**40 * rank())
         self.agent = make_agent(s, self.env, device, precision)
-        for value in self.agent.state_dict().values() if processes() > 1 else ():
-            dist.broadcast(value, 0)
+        if processes() > 1:  # all begin with the first one's networks
+            for value in self.agent.state_dict().values():
+                dist.broadcast(value, 0)
         self.step = self.updates = self.episode = 0  # made; made; begun
         self.over, self.length = True, 0  # whether the last episode ended; its environment steps
         self.explores, self.lead = True, 0  # who collects; by how many steps the explorer is ahead
@@ -605,8 +606,8 @@ class Run:
         return self.env.reset(seed=int(seed))[0]
 
     def note_decision(self, action: np.ndarray, over: bool, info: dict) -> None:
-        """Count a decision that was taken. After an episode, of a longer one after each TURN steps,
-        whoever has collected less, the explorer or the evaluated actor, collects next."""
+        """Count a decision. At an episode's end, and every TURN steps of a longer one, whoever has
+        collected fewer steps, the explorer or the evaluated actor, collects next."""
         before, self.length = self.length, int(self.env.get_wrapper_attr("episode_lengths"))
         self.step, self.over = self.step + sum(gathered(self.length - before)), over
         self.lead += (self.length - before) * (1 if self.explores else -1)
@@ -619,9 +620,9 @@ class Run:
             self.note({"train_return": whole["r"], "train_length": whole["l"]})
         self.bar.update(self.step - self.bar.n)
 
-    def note_update(self, metrics: dict[str, float]) -> None:
-        """Count an update that was made; every fiftieth goes to TensorBoard as it is."""
-        if self.updates % 50 == 0:
+    def note_update(self, metrics: dict[str, float], look: bool) -> None:
+        """Count an update that was made; one that was looked at goes to TensorBoard as it is."""
+        if look:
             for name, value in metrics.items():
                 self.writer.add_scalar(f"update/{name}", value, self.step)
         self.updates += 1
@@ -685,7 +686,7 @@ class Run:
     def save_if_due(self) -> None:
         """Write a checkpoint every `checkpoint_minutes`, and before the ring's reserve is full."""
         waited = time.monotonic() - self.clock >= 60 * self.s.checkpoint_minutes
-        if any(gathered(waited or self.replay.added - self.saved_rows >= self.replay.unsaved)):
+        if any(gathered(waited or self.replay.added - self.saved_rows >= self.replay.save_every)):
             self.save()
 
     def save(self) -> None:
@@ -762,7 +763,7 @@ CHANGEABLE = (
 
 
 def fixed_changes(made: dict[str, object], now: dict[str, object]) -> list[str]:
-    """Of the settings that a run was made with, those that are others now, and may not be."""
+    """What may not change in a run but has: each such setting, and the value that it had."""
     changed = (name for name in now if now[name] != made.get(name))
     return [f"{name} {made.get(name)}" for name in changed if name not in CHANGEABLE]
 
@@ -813,6 +814,11 @@ def take(networks: nn.Module, weights: dict[str, Tensor]) -> None:
     except RuntimeError as error:
         why = " ".join(str(error).split())
         raise ValueError(f"It is of other settings' or another version's networks: {why}") from None
+
+
+def make_env_of(s: Settings):
+    """The environment as an agent of these settings sees it."""
+    return make_env(s.env, s.action_repeat, s.camera_distance, s.floor_brightness)
 
 
 def make_agent(s: Settings, env, device: str = "auto", precision: str = "auto") -> Agent:
@@ -1023,9 +1029,10 @@ def train_run(run: Run, device: str, precision: str) -> int:
           f"some {disk:.1f} GB of disk", flush=True)  # fmt: skip
     launcher = ["torchrun", "--nproc-per-node", os.environ.get("LOCAL_WORLD_SIZE", "1")]
     launcher = launcher if dist.is_initialized() else [sys.executable]
-    options = {"--resume": str(run.folder), "--device": device, "--precision": precision}
-    given = [word for option in options.items() if option[1] != "auto" for word in option]
-    resume = "Go on with: " + shlex.join([*launcher, __file__, *given])
+    words = [*launcher, __file__, "--resume", str(run.folder)]
+    words += ["--device", device] if device != "auto" else []
+    words += ["--precision", precision] if precision != "auto" else []
+    resume = "Go on with: " + shlex.join(words)
     every = 0.5 if sys.stderr.isatty() else 30  # seconds between two lines of a log file
     try:
         bar = tqdm(

@@ -338,7 +338,7 @@ class WorldModel(nn.Module):
                          with `ends_ahead`, plus its mean in dreams along the recorded actions
             kl_standard  KL(posterior ‖ N(0, 1)), which gives the prior no gradient (§4.2)
             jeffreys     KL(posterior ‖ prior) + KL(prior ‖ posterior) (§4.2)
-            kl           max(KL(posterior ‖ prior), free nats), Dreamer's, for the last two
+            kl           max(KL(posterior ‖ prior), free nats): Dreamer's, instead of these two
 
         Departures from print: (4) has the squared errors with the sign of (3)'s log-likelihoods, by
         which they would be maximised; the prior of step t + 1 in (3) lacks the action, which

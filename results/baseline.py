@@ -13,6 +13,7 @@ seeds of every evaluation. A run that was stopped does not go on.
 
 import argparse
 import csv
+import dataclasses
 import json
 import re
 import sys
@@ -26,7 +27,7 @@ from gymnasium import wrappers
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import train
-from env import EnvironmentFault, Foreign, coverage, find_spec, make_env
+from env import EnvironmentFault, Foreign, coverage, find_spec
 from results.made_with import made_with
 
 COLUMNS = "env_steps wall_seconds eval_return eval_interval95 eval_length coverage".split()
@@ -40,8 +41,7 @@ USUAL = {  # by its name in plot.py, what its settings.json holds beside env and
 def make_world(arm: str, env_id: str) -> gym.Env:
     """The environment, warmed up as train.py's: a step is a decision, info["state"] its state."""
     if arm == "sac-pixels":
-        s = train.default_settings()
-        return make_env(env_id, s.action_repeat, s.camera_distance, s.floor_brightness)
+        return train.make_env_of(dataclasses.replace(train.default_settings(), env=env_id))
     world = Foreign(gym.make(find_spec(env_id), render_mode="rgb_array"))
     world = wrappers.RecordEpisodeStatistics(world)
     return wrappers.RepeatAction(world, USUAL[arm]["action_repeat"])

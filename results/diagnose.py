@@ -21,7 +21,7 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from actors import Episode, imagined_returns, play
-from results.play import command_line, exit_code, load, open_loop, strip
+from results.play import command_line, exit_code, load, open_loop, pictured, strip
 from results.plot import read_metrics
 from returns import survival
 from train import Agent, Patient, evaluation_seed
@@ -56,8 +56,10 @@ OWN, TAKEN = own_and_taken(OPEN_LOOP)
 
 
 def r_squared(predicted: np.ndarray, real: np.ndarray) -> float:
-    """The share of the variance that is predicted: 1 is exact, 0 no better than the mean of all."""
-    return 1 - np.square(predicted - real).mean() / max(np.var(real), 1e-12)
+    """The share of the variance that is predicted: 1 is exact, 0 no better than the mean of all;
+    nan where nothing varies, as where each step earns 1."""
+    variance = np.var(real)
+    return 1 - np.square(predicted - real).mean() / (variance if variance > 1e-12 else np.nan)
 
 
 def discounted(rewards: np.ndarray, gamma: float) -> np.ndarray:
@@ -71,18 +73,19 @@ def windows(x: Tensor, length: int) -> Tensor:
     return x.unfold(0, length, 1).movedim(-1, 0)
 
 
-def to_levels(picture: Tensor) -> Tensor:
-    """What the decoder gives, in grey levels from 0 to 255."""
-    return (255 * (picture + 0.5)).clamp(0, 255)
-
-
 def watch_alive(env) -> list[float]:
     """The part for being alive of each reward that a PyBullet robot gives from now on, a physics
     step each; it stays empty where the environment does not tell it apart."""
     robot, parts = env.unwrapped, []
     if isinstance(getattr(robot, "_alive", None), float):  # since the step that make_env takes
-        step = robot.step
-        robot.step = lambda action: (step(action), parts.append(robot._alive))[0]
+        plain = robot.step
+
+        def step(action):
+            result = plain(action)
+            parts.append(robot._alive)
+            return result
+
+        robot.step = step
     return parts
 
 
@@ -144,7 +147,7 @@ def measure(agent: Agent, name: str, episode: Episode) -> dict[str, np.ndarray]:
     found["greedy"] = actor.greedy(states[:-1]).cpu().numpy()
     if hasattr(actor, "distribution"):
         found["sigma"] = actor.distribution(states[:-1]).stddev.cpu().numpy()
-    seen = to_levels(model.decoder(model.decoded(states[1:])))
+    seen = pictured(model, states[1:])
     found["seen_image"] = (seen - images[1:].float()).square().mean((1, 2, 3)).cpu().numpy()
     if len(rewards) > OPEN_LOOP:
         found |= follow(model, states, images, actions, torch.from_numpy(rewards))
@@ -162,7 +165,7 @@ def follow(model, states: Tensor, images: Tensor, actions: Tensor, rewards: Tens
     begun = slice(0, len(rewards) - OPEN_LOOP, 5)
     dreamt = model.along(states[begun], windows(actions, OPEN_LOOP)[:, begun])[1:]
     both = model.predict_reward(dreamt).cpu(), windows(rewards, OPEN_LOOP)[:, begun]
-    picture = to_levels(model.decoder(model.decoded(dreamt).flatten(0, 1)))
+    picture = pictured(model, dreamt.flatten(0, 1))
     truth = windows(images[1:], OPEN_LOOP)[:, begun].float()
     pictures = picture.unflatten(0, dreamt.shape[:2]), images[begun].float()
     errors = [(x - truth).square().mean((2, 3, 4)) for x in pictures]
@@ -327,8 +330,8 @@ VERDICTS = (
     # Whatever follows is learnt from these; a model that learns has 0.5 by 10,000 steps.
     (lambda of: of[REWARDS] < 0.3,
      "the model does not know the rewards that it is shown: more prefill, or weigh rewards more."),
-    # A single end may be of a rare kind.
-    (lambda of: of[ENDS] >= 3 and of[EXPECTED] < 0.5 * of[ENDS],
+    # A single end may be of a rare kind; exactly 0 is an agent's without a model of ends.
+    (lambda of: of[ENDS] >= 3 and 0 < of[EXPECTED] < 0.5 * of[ENDS],
      "the model does not see ends coming: weigh terminations more."),
     # Hopper and Walker2D had 0.59 to 0.83 when they did not stand.
     (lambda of: of[ENDS] >= 3 and of.get(OUTLIVED, 0) > 0.6,
@@ -363,7 +366,7 @@ def diagnose(command: argparse.Namespace) -> Path:
     if command.episodes < 1:
         raise ValueError(f"--episodes is {command.episodes}: give 1 or more.")
     folder = command.folder
-    s, env, agent, networks = load(folder, command.checkpoint, command.device, command.precision)
+    s, env, agent, networks = load(folder, command.checkpoint, command.device)
     played, found, named = {}, {}, {}
     alive = watch_alive(env)
     for name in agent.actors:

@@ -20,8 +20,8 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import train
 from actors import play
-from env import Replay, make_env
-from results.play import ACTORS, exit_code
+from env import Replay
+from results.play import exit_code
 
 EXPERIENCE = (  # settings of what was seen, which only the run itself could change
     "env", "action_repeat", "camera_distance", "floor_brightness", "replay_capacity",
@@ -36,7 +36,7 @@ def frozen(folder: Path, like: train.Command, seed: int) -> tuple[gym.Env, train
     if other := [name for name in EXPERIENCE if getattr(s, name) != getattr(made, name)]:
         raise ValueError(f"{folder} has its own experience: leave out {', '.join(other)}.")
     saved = train.read_checkpoint(folder)[1]
-    env = make_env(s.env, s.action_repeat, s.camera_distance, s.floor_brightness)
+    env = train.make_env_of(s)
     torch.manual_seed(seed)
     agent = train.make_agent(s, env, like.device, like.precision)
     of_model = (item for item in saved["agent"].items() if item[0].startswith("model."))
@@ -53,9 +53,8 @@ def learn(command: argparse.Namespace, settings: list[str]) -> None:
     if min(command.updates, command.every, command.episodes) < 1:
         raise ValueError("--updates, --every and --episodes are 1 at least.")
     like = train.parse(["--resume", str(command.folder), *settings])
-    s, name = like.settings, command.actor
-    if name not in ACTORS[: 1 + s.deterministic_actor]:
-        raise ValueError(f"{command.folder} has no {name} actor.")
+    s = like.settings
+    name = "deterministic" if s.deterministic_actor else "stochastic"  # the one that is evaluated
     env, agent, replay = frozen(command.folder, like, command.seed)
     rng, promised = np.random.default_rng(command.seed), []
     for updates in range(1, command.updates + 1):
@@ -63,11 +62,12 @@ def learn(command: argparse.Namespace, settings: list[str]) -> None:
         with torch.no_grad(), agent.autocast():
             seen = agent.model.observe(batch["image"], batch["action"], batch["is_first"])
         starts = train.dream_starts(seen.state, train.live_rows(agent, batch), s.starts)
-        train.update_actor(agent, name, starts, s.beta_start, metrics := {}, updates % 50 == 1)
+        metrics = {}
+        train.update_actor(agent, name, starts, s.beta_start, metrics, look=False)
         promised.append(train.as_numbers(metrics)[f"{name}_actor/return"])
         agent.follow()
         if updates % command.every == 0:
-            policy = agent.players[name].greedy
+            policy = agent.evaluated.greedy
             seeds = [train.evaluation_seed(k) for k in range(command.episodes)]
             episodes = [play(agent, env, policy, seed, s.eval_max_steps) for seed in seeds]
             earned = " ".join(f"{e.total:.0f} ({e.length})" for e in episodes)
@@ -87,7 +87,6 @@ def main(arguments: list[str]) -> int:
     add("--every", type=int, default=300, help="updates between two lines (%(default)s)")
     add("--episodes", type=int, default=4, help="played for a line (%(default)s)")
     add("--seed", type=int, default=0, help="of networks and dreams (%(default)s)")
-    add("--actor", choices=ACTORS, default="deterministic", help="which learns (%(default)s)")
     return exit_code(lambda: learn(*parser.parse_known_args(arguments)))
 
 

@@ -16,23 +16,26 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image, ImageDraw
+from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import train
 from actors import Episode, play
-from env import EnvironmentFault, make_env
+from env import EnvironmentFault
 
 ACTORS = ("stochastic", "deterministic")
 SHORTEST = 20  # milliseconds: browsers show a GIF's frame no shorter
 
 
-def load(folder: Path, checkpoint: str, device: str, precision: str):
+def load(folder: Path, checkpoint: str, device: str):
     """A run's settings, environment and agent, and what its networks are called. A ValueError, in
     one sentence, if the folder holds none, or not for this machine."""
     s = train.read_settings(folder)
-    env = make_env(s.env, s.action_repeat, s.camera_distance, s.floor_brightness)
-    agent = train.make_agent(s, env, device, precision)
+    env = train.make_env_of(s)
+    agent = train.make_agent(s, env, device, "float32")  # as it acts, see actors.act
     if checkpoint == "newest":
+        if not any((folder / name).exists() for name in train.CHECKPOINTS):
+            raise ValueError(f"{folder} holds no checkpoint: --checkpoint best plays its best.pt.")
         saved = train.read_checkpoint(folder)[1]
         weights, name = saved["agent"], f"{saved['kept']['step']}"
     else:
@@ -47,6 +50,11 @@ def load(folder: Path, checkpoint: str, device: str, precision: str):
     return s, env, agent, name
 
 
+def pictured(model, states: Tensor) -> Tensor:
+    """What the decoder makes of states: (M, D) -> (M, 64, 64, 3), grey levels from 0 to 255."""
+    return (255 * (model.decoder(model.decoded(states)) + 0.5)).clamp(0, 255)
+
+
 @torch.no_grad()
 def open_loop(agent: train.Agent, episode: Episode, frames: int, context: int = 5) -> np.ndarray:
     """What the model dreams when it sees `context` images and then only the actions taken.
@@ -58,13 +66,12 @@ def open_loop(agent: train.Agent, episode: Episode, frames: int, context: int = 
     frames = min(frames, len(episode.states))
     context = min(context, frames)
     actions = torch.from_numpy(episode.actions[context - 1 : frames - 1]).to(agent.device)
-    with agent.autocast(), torch.random.fork_rng():
+    with torch.random.fork_rng():
         torch.manual_seed(0)
         start = episode.states[context - 1 : context]
         dreamt = agent.model.along(start, actions.unsqueeze(1))[1:, 0]
         states = torch.cat([episode.states[:context], dreamt])
-        prediction = agent.model.decoder(agent.model.decoded(states))
-    prediction = (255 * (prediction + 0.5)).clamp(0, 255).byte().cpu().numpy()
+    prediction = pictured(agent.model, states).byte().cpu().numpy()
     truth = episode.images[:frames]
     difference = (128 + (prediction.astype(int) - truth) // 2).astype(np.uint8)
     return np.stack([truth, prediction, difference])
@@ -99,7 +106,7 @@ def show(command: argparse.Namespace) -> None:
     if command.episodes < 1:
         raise ValueError(f"--episodes is {command.episodes}: give 1 or more.")
     folder = command.folder
-    s, env, agent, name = load(folder, command.checkpoint, command.device, command.precision)
+    s, env, agent, name = load(folder, command.checkpoint, command.device)
     if command.actor not in ("evaluated", *agent.players):
         raise ValueError(f"{folder} has no {command.actor} actor: leave out --actor.")
     actor = agent.evaluated if command.actor == "evaluated" else agent.players[command.actor]
@@ -133,17 +140,21 @@ def command_line(program: str, says: str, episodes: int) -> argparse.ArgumentPar
     add("--episodes", type=int, default=episodes, help="of an actor (%(default)s)")
     add("--checkpoint", choices=("newest", "best"), default="newest", help=which)
     add("--device", choices=("auto", "cpu", "cuda"), default="auto")
-    add("--precision", choices=("auto", "bfloat16", "float32"), default="auto")
     return parser
 
 
 def exit_code(work: Callable[[], object]) -> int:
-    """Does it: 0 done, 1 the environment failed, 2 bad input; what was wrong, in one sentence."""
+    """Does it: 0 done, 1 it failed, 2 bad input, 130 Ctrl-C; what was wrong, in one sentence."""
     try:
         work()
-    except (ValueError, OSError, EnvironmentFault) as error:
+    except (EnvironmentFault, FloatingPointError) as error:
         print(error, file=sys.stderr)
-        return 1 if isinstance(error, EnvironmentFault) else 2
+        return 1
+    except (ValueError, OSError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
     return 0
 
 

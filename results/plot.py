@@ -65,11 +65,11 @@ def read_metrics(path: Path) -> dict[str, np.ndarray]:
     written, or none be there yet. A ValueError, in one sentence, if it is another table."""
     text = path.read_text(errors="replace") if path.is_file() else ""
     rows = list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))
-    if rows and not rows[0].keys() >= {*COLUMNS}:
-        lacking = ", ".join(sorted({*COLUMNS} - rows[0].keys()))
+    names = rows[0].keys() if rows else {}
+    if rows and (lacking := ", ".join(sorted({*COLUMNS} - names))):
         raise ValueError(f"{path} is no run's metrics, without {lacking}: left out.")
     try:
-        return {name: np.array([float(row[name]) for row in rows]) for name in rows[:1] and rows[0]}
+        return {name: np.array([float(row[name]) for row in rows]) for name in names}
     except (ValueError, TypeError):
         raise ValueError(f"{path} has rows that are no numbers: left out.") from None
 

@@ -56,14 +56,16 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     command.runs = runs(command, command.options + arguments[cut + 1 :])
     if command.index is not None:
         command.runs = dict([*command.runs.items()][command.index :][:1])
-    if not command.runs or min(command.workers - 1, command.index or 0, *command.seeds) < 0:
+    low = command.workers < 1 or min(command.seeds) < 0 or (command.index or 0) < 0
+    if low or not command.runs:
         parser.error("--workers: 1 or more; --seeds: 0 or more; --index: one that --list shows.")
     try:  # what the first run cannot have, none can
-        command.list or command.out.mkdir(parents=True, exist_ok=True)
         train.check(train.parse(next(iter(command.runs.values()))).settings.to_json())
-        for folder, options in command.runs.items() if not command.list else ():
-            if others := differing(folder, options):
-                raise ValueError(f"{folder} is of a run with {others}: name another --out.")
+        if not command.list:
+            command.out.mkdir(parents=True, exist_ok=True)
+            for folder, options in command.runs.items():
+                if others := differing(folder, options):
+                    raise ValueError(f"{folder} is of a run with {others}: name another --out.")
     except (ValueError, OSError) as error:
         parser.error(error)
     return command

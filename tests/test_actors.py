@@ -25,11 +25,6 @@ from actors import (
 GAMMA = 0.9
 
 
-@pytest.fixture(autouse=True)
-def one_seed():
-    torch.manual_seed(0)
-
-
 def always(actor, *outputs):
     """The actor with its last layer fixed, whatever the state."""
     nn.init.zeros_(actor.net[-1].weight)

@@ -1,6 +1,7 @@
 """The four arms, the two presets, one update of each, against the table of the paper's figure."""
 
 import dataclasses
+import functools
 import math
 from collections import defaultdict
 
@@ -10,6 +11,7 @@ import torch
 from benchmark_update import PARTS, TimedAgent, clock
 from scipy import stats
 
+import train
 from actors import critic_loss
 from env import Replay
 from train import (
@@ -188,7 +190,7 @@ def test_maxent_is_the_default():
 
 @pytest.mark.parametrize("arm", NAMES)
 def test_arms_hold_the_networks_of_the_table_and_evaluate_the_right_actor(arm):
-    s = tiny(arm)
+    s = tiny(arm, free_nats=2.0, mdn_components=3, mdn_min_std=0.3)
     agent = make_agent(s)
     with_entropy = arm in ("dreamer-maxent", "maxent")
     actors = ["stochastic", "deterministic"] if with_entropy else ["stochastic"]
@@ -198,6 +200,10 @@ def test_arms_hold_the_networks_of_the_table_and_evaluate_the_right_actor(arm):
     assert (agent.model.termination is not None) == (arm in ("revised", "maxent"))
     critic = agent.critics["stochastic"].net[0].in_features
     assert critic == 8 + s.stoch + ACTIONS * (arm in ("revised", "maxent"))  # Q(s, a) or V(s)
+    seen = agent.model.decoder.linear[0].in_features
+    assert seen == s.stoch + 8 * (arm in ("dreamer", "dreamer-maxent"))  # z or (h, z)
+    assert agent.model.free_nats == 2
+    assert not with_entropy or (agent.mdn.components, agent.mdn.min_std) == (3, 0.3)
 
 
 SWITCHES = [name for name, value in dataclasses.asdict(Settings()).items() if value is True]
@@ -210,7 +216,12 @@ def test_each_modification_can_be_taken_away_alone_and_still_trains(name):
     assert s == dataclasses.replace(paper, **{name: False}) != paper
     _, metrics = updated(tiny("maxent", **{name: False}))
     assert all(math.isfinite(value) for value in metrics.values())
-    assert metrics != updated(tiny("maxent"))[1]
+    assert metrics != plain_metrics()
+
+
+@functools.cache
+def plain_metrics() -> dict[str, float]:
+    return updated(tiny("maxent"))[1]
 
 
 @pytest.mark.parametrize("observe_first", [True, False])
@@ -223,6 +234,23 @@ def test_first_action_depends_on_the_first_observation_unless_blind(observe_firs
         actions.append(act(agent, agent.evaluated.greedy, image, zeros, None)[0])
     assert (actions[0] != actions[1]).all() == observe_first
     assert np.array_equal(*actions) != observe_first
+
+
+def test_to_act_image_by_image_is_to_observe_them_all():
+    """What acts remembers: its state is that of the sequence up to now."""
+    agent, rng = make_agent(tiny("maxent", stoch=16)), np.random.default_rng(0)  # randn's blocks
+    images = rng.integers(256, size=(4, 64, 64, 3), dtype=np.uint8)
+    actions = rng.uniform(-1, 1, (4, ACTIONS)).astype(np.float32)
+    torch.manual_seed(0)
+    state, states = None, []
+    for image, last in zip(images, actions, strict=True):
+        action, state = act(agent, agent.evaluated.greedy, image, last, state)
+        np.testing.assert_array_equal(action, agent.evaluated.greedy(state)[0].detach())
+        states.append(state)
+    torch.manual_seed(0)
+    first = torch.tensor([[True, False, False, False]])
+    whole = agent.model.observe(torch.tensor(images)[None], torch.tensor(actions)[None], first)
+    torch.testing.assert_close(torch.cat(states), whole.state[0].detach(), rtol=1e-4, atol=1e-5)
 
 
 def test_beta_falls_linearly_from_a_fifth_to_a_ten_thousandth():
@@ -283,13 +311,16 @@ def test_an_update_in_bfloat16_is_that_in_float32_but_for_its_rounding(arm):
 
     exact, rounded = run(False), run(True)
     for name, (loss, gradients) in exact.items():
-        assert rounded[name][0] == pytest.approx(loss, rel=0.01), name
+        # absolutely, too: a return near 0 by chance is a sum of numbers that are not
+        assert rounded[name][0] == pytest.approx(loss, rel=0.01, abs=1e-3), name
         differences = {
             path: rounded[name][1][path] - gradient for path, gradient in gradients.items()
         }
         assert any(difference.any() for difference in differences.values())  # it was rounded
+        largest = max(gradient.norm() for gradient in gradients.values())
         for path, difference in differences.items():
-            assert difference.norm() <= 0.15 * gradients[path].norm(), f"{name}: {path}"
+            bound = 0.15 * gradients[path].norm() + 1e-3 * largest
+            assert difference.norm() <= bound, f"{name}: {path}"
 
 
 def test_target_mdn_starts_as_the_online_one_and_moves_a_tenth_of_the_way_to_it():
@@ -341,7 +372,7 @@ def test_each_step_of_an_update_touches_only_its_own_network(arm):
 
 def test_a_step_is_adams_on_the_clipped_gradient_of_its_own_loss():
     """Adam steps by its learning rate against the sign of a gradient that stays the same."""
-    s = tiny("maxent", grad_clip=0.5)
+    s = tiny("maxent", grad_clip=0.5, critic_lr=3e-4)
     agent = make_agent(s)
     rates = dict(model=s.model_lr, mdn=s.mdn_lr, actor=s.actor_lr, critic=s.critic_lr)
     for name in agent.optimisers:
@@ -370,23 +401,24 @@ def test_the_benchmark_times_each_part_of_an_update():
 
 @pytest.mark.parametrize("arm", NAMES)
 def test_losses_are_the_weighted_sums_of_their_named_terms(arm):
-    """Model: §2's coefficients, 0.1 and 0.1 or 1. Actors: −R_0, the stochastic one's − β Ĥ."""
+    """Model: each by its own setting. Actors: −R_0, the stochastic one's − β Ĥ."""
     losses = {}
 
     def watch(agent, name, loss, step):
         losses[name] = loss.item()
         step()
 
-    metrics = watched_update(tiny(arm, kl_weight=1.5, reward_weight=2.0), watch)
+    weights = {"image": 0.5, "reward": 2.0, "kl": 1.5, "kl_standard": 0.3, "jeffreys": 0.7}
+    s = tiny(arm, **{f"{name}_weight": weight for name, weight in weights.items()})
+    metrics = watched_update(s, watch)
     terms = {k.removeprefix("model/"): v for k, v in metrics.items() if k.startswith("model/")}
     del terms["grad_norm"]
     revised = arm in ("revised", "maxent")
     names = {"image", "reward"} | (
         {"termination", "kl_standard", "jeffreys"} if revised else {"kl"}
     )
-    weights = {"kl_standard": 0.1, "jeffreys": 0.1, "kl": 1.5, "reward": 2.0, "termination": 10}
     assert terms.keys() == names
-    total = sum(weights.get(name, 1) * term for name, term in terms.items())
+    total = sum(weights.get(name, 10) * term for name, term in terms.items())  # §2: ends weigh 10
     assert losses["model"] == pytest.approx(total, rel=1e-6)
     if revised:  # first state only
         expected = -metrics["stochastic_actor/return"]
@@ -557,11 +589,52 @@ def test_half_of_the_live_states_are_drawn_anew_for_each_dream():
 @pytest.mark.parametrize("detach_policy", [True, False])
 def test_gradient_passes_through_what_the_policy_sees_unless_it_is_detached(detach_policy):
     """The first action moves the states after it; whether it moves the actions in them is the
-    switch: an actor's gradient differs, its return does not."""
-    metrics = updated(tiny("revised", detach_policy=detach_policy))[1]
-    other = updated(tiny("revised", detach_policy=not detach_policy))[1]
-    assert metrics["stochastic_actor/return"] == other["stochastic_actor/return"]
-    assert metrics["stochastic_actor/grad_norm"] != other["stochastic_actor/grad_norm"]
+    switch."""
+    agent = make_agent(tiny("revised", detach_policy=detach_policy))
+    state = torch.randn(5, agent.model.size, requires_grad=True)
+    action = train.dreaming(agent, "stochastic")(state).sum()
+    (gradient,) = torch.autograd.grad(action, state, allow_unused=True)
+    assert (gradient is None) == detach_policy
+
+
+@pytest.mark.parametrize("density", ["mdn", "knn"])
+def test_each_discount_goes_where_it_belongs(density, monkeypatch):
+    """γ and λ into returns, γ_q into the distribution of future states."""
+    asked = defaultdict(set)
+
+    def watch(name):
+        function = getattr(train, name)
+
+        def watched(*given):
+            asked[name].add(tuple(x for x in given if isinstance(x, float)))
+            return function(*given)
+
+        monkeypatch.setattr(train, name, watched)
+
+    of_q = ["entropy", "mdn_loss"] if density == "mdn" else ["particle_entropy"]
+    for name in ("imagined_returns", *of_q):
+        watch(name)
+    updated(tiny("maxent", density=density, gamma=0.9, lam=0.7, gamma_q=0.6))
+    assert asked == {"imagined_returns": {(0.9, 0.7)}} | {name: {(0.6,)} for name in of_q}
+
+
+@pytest.mark.parametrize("name", ["stochastic", "deterministic"])
+def test_action_penalty_is_the_sum_of_squares_before_the_bounds(name):
+    losses = []
+    for penalty in (0.0, 0.5):
+        agent = make_agent(tiny("maxent", action_penalty=penalty))
+        last, step = agent.actors[name].net[-1], agent.step
+        torch.nn.init.zeros_(last.weight)
+        torch.nn.init.constant_(last.bias[:ACTIONS], 2.0)
+
+        def watched(n, loss, *rest, step=step):
+            losses.extend([loss.item()] if n == f"{name}_actor" else [])
+            step(n, loss, *rest)
+
+        agent.step = watched
+        torch.manual_seed(1)
+        update(agent, make_batch(agent.s), 0.1)
+    assert losses[1] - losses[0] == pytest.approx(0.5 * 4 * ACTIONS, rel=1e-4)
 
 
 @pytest.mark.parametrize("name", ["stochastic", "deterministic"])

@@ -17,6 +17,7 @@ import torch.multiprocessing as mp
 from test_arms import make_agent, make_batch, tiny
 from test_train import metrics, wait_for
 
+import actors
 import train
 from train import ARMS, Run, Settings, check, default_settings, read_checkpoint, update
 
@@ -93,16 +94,13 @@ def free_nats(weight: float) -> float:
     return small + weight * (gradients(whole(), s)["metrics"]["model/kl"] - small)
 
 
-CASES = (
-    {arm: tiny(arm, **STILL) for arm in ARMS}
-    | {f"{arm}, half the starts": tiny(arm, starts=0.5, **STILL) for arm in ARMS}
-    | {
-        "blind": tiny("maxent", observe_first=False, **STILL),
-        "half the images": tiny("maxent", decode_share=0.5, **STILL),
-        "penalty": tiny("maxent", action_penalty=0.01, **STILL),
-        "ends ahead": tiny("maxent", ends_ahead=2, burn_in=1, **STILL),
-    }
-)
+CASES = {arm: tiny(arm, **STILL) for arm in ARMS} | {
+    "half the starts": tiny("maxent", starts=0.5, **STILL),
+    "blind": tiny("maxent", observe_first=False, **STILL),
+    "half the images": tiny("maxent", decode_share=0.5, **STILL),
+    "penalty": tiny("maxent", action_penalty=0.01, **STILL),
+    "ends ahead": tiny("maxent", ends_ahead=2, burn_in=1, **STILL),
+}
 MARGINS = {"below all, above one": 0.5, "above all, below one": 1.5}
 
 
@@ -112,14 +110,14 @@ def keep_gradients(rank: int, folder: Path, cases: dict[str, Settings]) -> None:
 
 
 def keep_weights(rank: int, folder: Path) -> None:
-    """Those after fifty updates on different rows, and the random number that comes next."""
+    """Those after twelve updates on different rows, and the random number that comes next."""
     s = dataclasses.replace(tiny("maxent"), starts=0.5, play_rate=0.1)
     agent = make_agent(s)
     torch.manual_seed(rank)
-    for number in range(50):
+    for number in range(12):
         batch = shard(2 * number + rank)
         batch["terminated"][0, number % LENGTH] = rank == 0
-        update(agent, batch, 0.1, look=number % 10 == 0)
+        update(agent, batch, 0.1, look=number % 5 == 0)
     torch.save((agent.state_dict(), torch.rand(1)), folder / f"weights.{rank}")
 
 
@@ -176,13 +174,13 @@ def apart(tmp_path_factory) -> Path:
     for worker in workers:
         worker.start()
     for worker in workers:
-        worker.join(120)
+        worker.join(600)
     assert [worker.exitcode for worker in workers] == [0, 9]
     return folder
 
 
 def test_a_process_that_dies_leaves_no_other_waiting(apart):
-    assert float((apart / "seconds").read_text()) < 20
+    assert float((apart / "seconds").read_text()) < 60
 
 
 @pytest.mark.parametrize("case", [*CASES, *MARGINS])
@@ -202,7 +200,7 @@ def test_gradients_are_those_of_one_process_with_all_shards_as_its_batch(case, a
     assert first != second  # each has its own rows
 
 
-def test_parameters_stay_equal_over_fifty_updates(apart):
+def test_parameters_stay_equal_over_twelve_updates(apart):
     (first, mine), (second, other) = (torch.load(apart / f"weights.{rank}") for rank in range(2))
     before = make_agent(tiny("maxent")).state_dict()
     assert all(torch.equal(first[name], second[name]) for name in first)
@@ -216,7 +214,7 @@ def test_an_infinite_loss_in_one_process_stops_both_and_changes_neither(apart):
         assert not math.isfinite(norm) and same
 
 
-@pytest.mark.parametrize("arm", ARMS)
+@pytest.mark.parametrize("arm", ["dreamer", "maxent"])
 def test_an_update_of_one_process_is_the_same_bit_for_bit_with_and_without_torchrun(arm, tmp_path):
     def after() -> tuple[dict, dict]:
         agent = make_agent(s)
@@ -266,7 +264,7 @@ def test_the_newest_checkpoint_that_all_processes_have_is_taken(tmp_path, monkey
 TINY = (
     "--deter 16 --stoch 8 --hidden 16 --units 16 --depth 2 --mdn-units 16 --horizon 5 --starts 0.5 "
     "--batch-size 4 --length 8 --prefill 60 --eval-episodes 3 --random-action 0.5 "
-    "--steps 400 --eval-every 200 --checkpoint-minutes 0.002"
+    "--steps 300 --eval-every 150 --checkpoint-minutes 0.002"
 ).split()
 
 
@@ -284,8 +282,8 @@ def torchrun(*arguments, options=()) -> subprocess.Popen:
 
 def worker(launcher: subprocess.Popen, rank: int) -> int:
     """The process number of a rank."""
-    children = subprocess.run(["pgrep", "-P", str(launcher.pid)], capture_output=True, text=True)
-    for child in children.stdout.split():
+    children = Path(f"/proc/{launcher.pid}/task/{launcher.pid}/children").read_text()
+    for child in children.split():
         if f"RANK={rank}" in Path(f"/proc/{child}/environ").read_text().split("\0"):
             return int(child)
     raise AssertionError(f"no rank {rank}")
@@ -320,7 +318,10 @@ def test_each_process_keeps_its_own_and_the_first_the_rest(uninterrupted):
     assert saved[0]["agent"].keys() == saved[1]["agent"].keys()
     assert all(torch.equal(saved[0]["agent"][k], saved[1]["agent"][k]) for k in saved[0]["agent"])
     rows, other = (each["kept"]["saved_rows"] for each in saved)
-    assert abs(rows - other) < 30 and 2 * (rows + other) > 400  # steps are those of both
+    assert abs(rows - other) < 30 and 2 * (rows + other) > 300  # steps are those of both
+    begun = [train.Replay(500_000, 3, uninterrupted / folder / "replay.bin").read(0)
+             for folder in ("", "rank-1")]  # fmt: skip
+    assert begun[0] != begun[1]  # each has episodes of its own
     assert int(metrics(uninterrupted)[-1]["env_steps"]) == saved[1]["kept"]["step"]
 
 
@@ -363,6 +364,20 @@ def test_ctrl_c_saves_in_all_processes_and_says_how_to_go_on(uninterrupted, tmp_
     assert len(kept) == 2 and kept[0] == kept[1]
     launcher = torchrun("--resume", folder)
     ends_as(uninterrupted, folder, launcher)
+
+
+def test_processes_share_an_evaluations_episodes_out(monkeypatch):
+    def played(agent, env, policy, seed, most):
+        seeds.append(seed)
+        return actors.Episode(*[None] * 5, total=0.0, length=1)
+
+    seeds, agent = [], make_agent(tiny("revised", eval_episodes=5))
+    monkeypatch.setattr(train, "processes", lambda: 2)
+    monkeypatch.setattr(train, "play", played)
+    for rank in (0, 1):
+        monkeypatch.setattr(train, "rank", lambda rank=rank: rank)
+        train.evaluate(agent, None, lambda text: None)
+    assert sorted(seeds) == sorted(train.evaluation_seed(k) for k in range(5))
 
 
 @pytest.mark.parametrize(

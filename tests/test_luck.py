@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -19,6 +20,7 @@ import pytest
 import torch
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
+from scipy import stats
 from test_train import LONG, TINY, command, metrics, one_sentence, run, start, wait_for
 
 import train
@@ -186,18 +188,12 @@ class Endless(Base):
         return *super().step(action)[:2], False, False, {}
 
 
-def test_an_evaluation_of_an_endless_episode_ends(register, tmp_path):
-    folder = tmp_path / "run"
-    arguments = ["--env", register(Endless), "--run-dir", str(folder), "--eval-max-steps", "30"]
-    assert train.main([*arguments, *FAST]) == 0
-    assert [row["eval_length"] for row in metrics(folder)] == ["30", "30"]
-
-
-def test_an_episode_that_never_ends_makes_no_checkpoint_of_many_parts(register, tmp_path):
+def test_an_endless_episode_is_evaluated_and_makes_no_checkpoint_of_many_parts(register, tmp_path):
     """A part of a checkpoint for each action of the episode took 11 s after 50,000 of them."""
     folder, parts = tmp_path / "run", []
     arguments = ["--env", register(Endless), "--run-dir", str(folder), "--eval-max-steps", "30"]
     assert train.main([*arguments, *FAST]) == 0
+    assert [row["eval_length"] for row in metrics(folder)] == ["30", "30"]
     for steps in ("180", "240"):
         with zipfile.ZipFile(folder / "checkpoint.pt") as file:
             parts.append(len(file.namelist()))
@@ -221,16 +217,6 @@ class Raises(Fails):
         return 1 / 0
 
 
-class NoNumber(Fails):
-    def fail(self, result):
-        return result[0], float("nan"), *result[2:]
-
-
-class Enormous(Fails):
-    def fail(self, result):
-        return result[0], 1e30, *result[2:]
-
-
 class Leaves(Fails):
     def fail(self, result):
         sys.exit("bye")
@@ -250,8 +236,8 @@ class RaisesWhenItRenders(Base):
 
 
 @pytest.mark.parametrize("environment, word", [
-    (Raises, "ZeroDivisionError"), (NoNumber, "nan"), (Enormous, "1e+30"), (Leaves, "SystemExit"),
-    (RaisesAtReset, "could not allocate"), (RaisesWhenItRenders, "no screen"),
+    (Leaves, "SystemExit"), (RaisesAtReset, "could not allocate"),
+    (RaisesWhenItRenders, "no screen"),
 ])  # fmt: skip
 def test_what_an_environment_does_later_is_one_sentence_that_names_it(
     environment, word, register, tmp_path, capfd
@@ -390,23 +376,12 @@ class Signalled(Second):
         return super().step(action)
 
 
-@pytest.fixture
-def signals():
-    """Leaves to the other tests the handlers that they had."""
-    numbers = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
-    before = [signal.getsignal(number) for number in numbers]
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup ignores it; a run leaves it so
-    yield
-    for number, handler in zip(numbers, before, strict=True):
-        signal.signal(number, handler)
-
-
 @pytest.mark.parametrize("which, number, name", [
     (1, signal.SIGTERM, "-dash"), (2, signal.SIGTERM, "a folder/with blanks/"),
     (1, signal.SIGHUP, "~/run"), (2, signal.SIGINT, "plain"),
 ])  # fmt: skip
 def test_a_run_stopped_anywhere_goes_on_by_its_own_advice_as_if_it_had_not(
-    which, number, name, finished, register, tmp_path, monkeypatch, capfd, signals
+    which, number, name, finished, register, tmp_path, monkeypatch, capfd
 ):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(tmp_path))
@@ -476,9 +451,14 @@ def test_steps_below_what_was_done_end_the_run_and_lose_nothing(stub_run, capsys
 
 def test_best_is_of_the_whole_run_also_after_it_was_resumed(register, tmp_path, monkeypatch):
     returns, best = iter([3.0, 9.0, 5.0, 9.0]), []
-    monkeypatch.setattr("train.evaluate", lambda *_: [(next(returns), 1)])
+    monkeypatch.setattr("train.evaluate", lambda *_: [((r := next(returns)) - 1, 4), (r + 1, 10)])
     folder = tmp_path / "run"
-    assert train.main(["--env", register(Base), "--run-dir", str(folder), *FAST]) == 0
+    assert train.main(["--env", register(Repeats), "--run-dir", str(folder), *FAST]) == 0
+    row = {name: float(value) for name, value in metrics(folder)[0].items()}
+    _, end = stats.t.interval(0.95, 1, loc=3, scale=1)  # two returns, 2 and 4, of standard error 1
+    assert row["eval_return"] == 3 and row["eval_interval95"] == pytest.approx(end - 3, rel=1e-5)
+    assert [row[f"eval_length{kind}"] for kind in ("", "_min", "_max")] == [7, 4, 10]
+    assert (row["train_return"], row["train_length"]) == (5, 50)
     for steps in ("180", "240"):
         best.append((folder / "best.pt").read_bytes())
         assert train.main(["--resume", str(folder), "--steps", steps]) == 0
@@ -510,18 +490,15 @@ def mine(folder: Path) -> str:
     return shlex.join(command("--env", "mine:Mine-v0", "--run-dir", folder, *FAST))
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
-def test_a_terminal_that_knows_few_letters_stops_nothing(encoding, tmp_path, module):
-    done = shell(mine(tmp_path / "run"), module, PYTHONIOENCODING=encoding)
+def test_a_terminal_that_knows_few_letters_stops_nothing(tmp_path, module):
+    done = shell(mine(tmp_path / "run"), module, PYTHONIOENCODING="ascii")
     assert done.returncode == 0 and b"Traceback" not in done.stderr, done.stderr
     assert b"argv[0]" not in done.stdout + done.stderr and b"pybullet" not in done.stderr
-    help_text = shell(shlex.join(command("--help")), module, PYTHONIOENCODING=encoding)
+    help_text = shell(shlex.join(command("--help")), module, PYTHONIOENCODING="ascii")
     assert help_text.returncode == 0 and b"--beta-start" in help_text.stdout
 
 
-@pytest.mark.parametrize(
-    "ending", ["| head -c 1", "> /dev/full 2> /dev/full", ">&- 2>&- <&-", "2>&1 | head -c 1"]
-)
+@pytest.mark.parametrize("ending", ["> /dev/full 2> /dev/full", ">&- 2>&- <&-", "2>&1 | head -c 1"])
 def test_a_reader_who_goes_away_stops_nothing(ending, tmp_path, module):
     folder = tmp_path / "run"
     strict = mine(folder).replace(sys.executable, f"{sys.executable} -W error", 1)
@@ -554,10 +531,15 @@ def flip(path: Path, at: float) -> None:
 
 @pytest.mark.parametrize("at", np.linspace(0, 0.999, 12))
 def test_a_checkpoint_damaged_anywhere_is_said_and_the_one_before_it_taken(at, stub_run, capsys):
-    flip(stub_run / "checkpoint.pt", at)
-    path, saved = train.read_checkpoint(stub_run)
-    said = capsys.readouterr().err
-    assert (path.name == "checkpoint.previous.pt") == ("is damaged" in said)
+    path = stub_run / "checkpoint.pt"
+    content = bytearray(path.read_bytes())
+    with zipfile.ZipFile(path) as file:  # between its parts is padding, whose bits mean nothing
+        parts = [part for part in map(file.read, file.namelist()) if len(part) > 63]
+    part = parts[int(at * len(parts))]
+    content[content.index(part) + len(part) // 2] ^= 1
+    path.write_bytes(content)
+    read, saved = train.read_checkpoint(stub_run)
+    assert read.name == "checkpoint.previous.pt" and f"{path} is damaged" in capsys.readouterr().err
     assert saved["kept"].keys() == set(train.Run.KEPT)
 
 
@@ -612,22 +594,18 @@ def test_a_damaged_checkpoint_is_put_aside_and_what_is_gone_on_from_is_said(stub
     assert (stub_run / "checkpoint.damaged").is_dir() and (stub_run / "checkpoint.pt").is_file()
 
 
-@pytest.mark.parametrize("damage", ["no text", "half a row", "half a header", "gone", "longer"])
-def test_damaged_metrics_stop_nothing_and_later_rows_are_whole(damage, stub_run):
+@pytest.mark.parametrize("damage", ["no text", "half a row", "gone"])
+def test_metrics_that_were_damaged_are_written_anew_with_the_next_row(damage, stub_run):
+    """The rows are in the checkpoint."""
     path, content = stub_run / "metrics.csv", (stub_run / "metrics.csv").read_bytes()
+    before = metrics(stub_run)
     if damage == "gone":
         path.unlink()
     else:
-        path.write_bytes({
-            "no text": bytes(range(256)) * 1000, "half a row": content[:-50],
-            "half a header": content[:70], "longer": content + b"1,2",
-        }[damage])  # fmt: skip
+        path.write_bytes(bytes(range(256)) * 1000 if damage == "no text" else content[:-50])
     assert train.main(["--resume", str(stub_run), "--steps", "180"]) == 0
-    lines = path.read_bytes().splitlines()
-    header = next(line for line in lines if line.startswith(b"env_steps,"))
-    assert len(header.split(b",")) == len(lines[-1].split(b",")) > 20
-    assert lines[-1].startswith(b"180,") and lines[-1].count(b"nan") < 5
-    assert damage != "longer" or len(metrics(stub_run)) == 3
+    *first, last = metrics(stub_run)
+    assert first == before and last["env_steps"] == "180" and [*last.values()].count("nan") < 5
 
 
 def test_a_run_without_checkpoints_is_refused_and_left_as_it_is(stub_run, capsys):
@@ -652,14 +630,6 @@ def test_a_checkpoint_of_other_networks_is_refused(stub_run, capsys):
     refused(["--resume", stub_run, "--steps", "180"], capsys, "another version's networks")
 
 
-def test_a_lost_row_of_metrics_comes_back_with_the_next(stub_run):
-    path = stub_run / "metrics.csv"
-    lines = path.read_text().splitlines(keepends=True)
-    path.write_text("".join(lines[:-1]))
-    assert train.main(["--resume", str(stub_run), "--steps", "180"]) == 0
-    assert [int(row["env_steps"]) for row in metrics(stub_run)] == [60, 120, 180]
-
-
 def test_what_is_not_finite_leaves_the_checkpoint_before_it_and_a_lower_rate_is_taken(
     register, tmp_path, capsys
 ):
@@ -670,7 +640,9 @@ def test_what_is_not_finite_leaves_the_checkpoint_before_it_and_a_lower_rate_is_
     for _ in range(2):
         assert train.main(["--resume", str(folder)]) == 1
     assert checkpoints == {k: v for k, v in contents(folder).items() if k.startswith("checkpoint")}
-    assert "--model-lr" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert re.search(r"Not finite: \w+/\w+", said) and "--model-lr" in said
+    assert "Traceback" not in said
     assert train.main(["--resume", str(folder), "--model-lr", "1e-4"]) == 0
 
 
@@ -718,7 +690,7 @@ def test_the_best_evaluations_networks_are_kept(register, tmp_path, monkeypatch)
     returns = iter([3.0, 9.0, 5.0])
     states = []
 
-    def evaluate(agent, env, s, show):
+    def evaluate(agent, env, show):
         states.append({k: v.clone() for k, v in agent.state_dict().items()})
         return [(next(returns), 1)]
 

@@ -31,12 +31,6 @@ from mdn import (
 GAMMA = 0.9  # γ_q
 
 
-@pytest.fixture(autouse=True)
-def one_seed():
-    torch.set_num_threads(1)
-    torch.manual_seed(0)
-
-
 # The mixture
 
 

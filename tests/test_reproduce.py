@@ -14,6 +14,7 @@ from pathlib import Path
 
 import filelock
 import pytest
+from test_train import wait_for
 
 import results.reproduce as reproduce
 
@@ -223,7 +224,7 @@ def test_a_signal_is_passed_on_and_the_way_to_go_on_is_said(name, alone, stand_i
             time.sleep(0.01)
         os.kill(os.getpid(), getattr(signal, name))
 
-    threading.Thread(target=send).start()
+    threading.Thread(target=send, daemon=True).start()
     arguments = [*NARROW, "--envs", "Slow-v0", "--out", str(stand_in), "--workers", "1", *alone]
     assert reproduce.main(arguments) == 75
     assert (stand_in / "told").read_text() == name
@@ -263,8 +264,7 @@ def test_a_signal_saves_the_real_thing_for_the_next_call(number, tmp_path):
         line, stderr=subprocess.PIPE, text=True,  # a shell's background has SIGINT ignored
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
-    while not (first / "metrics.csv").exists() and process.poll() is None:
-        time.sleep(0.05)
+    wait_for(first / "metrics.csv", process)
     process.send_signal(number)
     _, said = process.communicate(timeout=120)
     assert process.returncode == 75 and "Go on with: " in said and "Traceback" not in said, said

@@ -118,8 +118,11 @@ def test_free_nats_clamp_the_mean_kl_and_stop_its_gradient_below():
 def test_unseen_rows_have_no_part_in_the_divergences():
     post, prior = gaussians(1.0, 2.0, 1, 2, 1), gaussians(0.0, 1.0, 1, 2, 1)
     post.loc[0, 0] = 100
-    terms = make_model().divergences(post, prior, torch.tensor([[0.0, 1.0]]))
-    assert terms["jeffreys"].item() == pytest.approx(1.75)
+    seen = torch.tensor([[0.0, 1.0]])
+    terms = make_model().divergences(post, prior, seen)
+    terms |= make_model(fixed_prior=False, free_nats=0.0).divergences(post, prior, seen)
+    expected = {"kl_standard": 2 - math.log(2), "jeffreys": 1.75, "kl": 2 - math.log(2)}
+    assert {name: term.item() for name, term in terms.items()} == pytest.approx(expected)
 
 
 def test_kl_to_the_fixed_prior_moves_the_posterior_alone_and_jeffreys_moves_both():
@@ -175,10 +178,10 @@ def test_image_loss_of_a_share_of_the_images_is_that_of_all_on_average(observe_f
     with torch.no_grad():
         errors = torch.stack([
             loss(part, batch, seed)[0]["image"] - loss(whole, batch, seed)[0]["image"]
-            for seed in range(200)
+            for seed in range(60)
         ])  # fmt: skip
     assert {len(each) for each in drawn} == {6}
-    assert 0 < abs(errors.mean()) < 3 * errors.std() / 200**0.5 < 0.1 * drawn[0].mean()
+    assert 0 < abs(errors.mean()) < 3 * errors.std() / 60**0.5 < 0.2 * drawn[0].mean()
 
 
 def test_image_loss_plus_the_log_density_is_the_same_for_every_reconstruction():
