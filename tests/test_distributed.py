@@ -264,7 +264,7 @@ def test_the_newest_checkpoint_that_all_processes_have_is_taken(tmp_path, monkey
 TINY = (
     "--deter 16 --stoch 8 --hidden 16 --units 16 --depth 2 --mdn-units 16 --horizon 5 --starts 0.5 "
     "--batch-size 4 --length 8 --prefill 60 --eval-episodes 3 --random-action 0.5 "
-    "--steps 300 --eval-every 150 --checkpoint-minutes 0.002"
+    "--steps 300 --eval-every 150 --checkpoint-minutes 0.005"
 ).split()
 
 

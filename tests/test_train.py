@@ -285,7 +285,7 @@ def test_an_evaluation_is_of_greedy_actions_and_leaves_the_random_numbers_as_the
 
 # ---- runs that are never lost --------------------------------------------------------------------
 
-LONG = ["--steps", 600, "--eval-every", 200, "--checkpoint-minutes", 0.002, *TINY]
+LONG = ["--steps", 600, "--eval-every", 200, "--checkpoint-minutes", 0.005, *TINY]
 
 
 @pytest.fixture(scope="module")
