@@ -108,7 +108,7 @@ class Settings:
     depth: Size = 32  # channels of the first convolution (Dreamer: 32)
     batch_size: Size = 50  # sequences per batch (Dreamer: 50)
     length: Annotated[Size, Interval(ge=2)] = 50  # rows per sequence (Dreamer: 50)
-    burn_in: Whole = 0  # first rows of one begun mid-episode: no reward, end or dream (ours)
+    burn_in: Whole = 0  # first rows of a window cut mid-episode: no reward, end or dream (ours)
     ends_ahead: Whole = 0  # steps of dreams in which ends are learnt too (ours)
     decode_share: Share = 1.0  # of a batch's images, those that are decoded (Dreamer: all)
     horizon: Size = 15  # imagined steps, and n of Eq. (10) (Dreamer)

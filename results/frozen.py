@@ -2,11 +2,12 @@
 
     python results/frozen.py runs/NAME --horizon 15 --no-critic-norm
 
-takes a run's newest world model and its replay, leaves both as they are, and trains one actor and
-its critic from nothing in dreams of that model, under the run's settings or those given. Prints
-what the actor is promised and what it then earns. Settings that earn more in the same model are
-better for the actors; where all are promised more than they earn, the model is at fault, and only
-other experience mends it. The run is stopped, or may be going on.
+takes a run's newest world model and its replay, leaves both as they are, and trains the actor that
+is evaluated (the explorer: --no-deterministic-actor) and its critic from nothing, in dreams of that
+model, under the run's settings or those given. Prints what the actor is promised and what it then
+earns. Settings that earn more in the same model are better for the actors; where all are promised
+more than they earn, the model is at fault, and only other experience mends it. The run is stopped,
+or may be going on.
 """
 
 import argparse

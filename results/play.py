@@ -35,7 +35,8 @@ def load(folder: Path, checkpoint: str, device: str):
     agent = train.make_agent(s, env, device, "float32")  # as it acts, see actors.act
     if checkpoint == "newest":
         if not any((folder / name).exists() for name in train.CHECKPOINTS):
-            raise ValueError(f"{folder} holds no checkpoint: --checkpoint best plays its best.pt.")
+            best = ": --checkpoint best plays its best.pt" if (folder / "best.pt").exists() else ""
+            raise ValueError(f"{folder} holds no checkpoint{best}.")
         saved = train.read_checkpoint(folder)[1]
         weights, name = saved["agent"], f"{saved['kept']['step']}"
     else:
@@ -43,7 +44,7 @@ def load(folder: Path, checkpoint: str, device: str):
             path, name = folder / "best.pt", "best"
             weights = torch.load(path, map_location="cpu", weights_only=True)
         except FileNotFoundError:
-            raise ValueError(f"{folder} was not evaluated yet: it has no best.pt.") from None
+            raise ValueError(f"{folder} has no best.pt: not evaluated yet, or not kept.") from None
         except Exception as error:  # damage has many
             raise ValueError(f"{path} is damaged: {type(error).__name__}.") from None
     train.take(agent, weights)

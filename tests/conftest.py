@@ -5,7 +5,14 @@ import signal
 import pytest
 import torch
 
-torch.set_num_threads(1)  # tiny tensors gain nothing by a second one; as OMP_NUM_THREADS=1 has it
+BEFORE = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_thread(request):
+    """Tiny tensors gain nothing by a second one; benchmark_update.py measures what a run has."""
+    if not request.config.getoption("benchmark_only", False):
+        torch.set_num_threads(1)
 
 
 @pytest.fixture(autouse=True)
@@ -15,10 +22,8 @@ def one_seed():
 
 @pytest.fixture(autouse=True)
 def handlers():
-    """A run that is trained in the test's own process takes them, and does not give them back."""
-    numbers = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
-    before = [signal.getsignal(number) for number in numbers]
+    """A run that is trained in this process, a fixture's too, takes them and keeps them."""
     signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup ignores it; a run leaves it so
     yield
-    for number, handler in zip(numbers, before, strict=True):
+    for number, handler in BEFORE.items():
         signal.signal(number, handler)

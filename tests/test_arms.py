@@ -595,6 +595,20 @@ def test_gradient_passes_through_what_the_policy_sees_unless_it_is_detached(deta
     action = train.dreaming(agent, "stochastic")(state).sum()
     (gradient,) = torch.autograd.grad(action, state, allow_unused=True)
     assert (gradient is None) == detach_policy
+    one, other = (updated(tiny("revised", detach_policy=on))[1] for on in (True, False))
+    assert one["stochastic_actor/return"] == other["stochastic_actor/return"]
+    assert one["stochastic_actor/grad_norm"] != other["stochastic_actor/grad_norm"]
+
+
+def test_saturated_and_deviation_are_of_an_actors_actions():
+    agent = make_agent(tiny("maxent"))
+    last = agent.actors["deterministic"].net[-1]
+    torch.nn.init.zeros_(last.weight)
+    last.bias.data = torch.tensor([40.0, 0.0])  # tanh(5) is beyond 0.99, 0 is not
+    metrics = update(agent, make_batch(agent.s), 0.1)
+    assert metrics["deterministic_actor/saturated"] == 0.5
+    assert metrics["deterministic_actor/deviation"] == pytest.approx(0, abs=1e-6)
+    assert metrics["stochastic_actor/deviation"] > 1e-4
 
 
 @pytest.mark.parametrize("density", ["mdn", "knn"])

@@ -329,7 +329,7 @@ def test_a_run_killed_in_one_process_and_restarted_equals_one_never_killed(unint
     folder = tmp_path / "run"
     launcher = torchrun("--run-dir", folder, *TINY, options=["--max-restarts", "1"])
     wait_for(folder / "rank-1/checkpoint.previous.pt", launcher)
-    time.sleep(0.5)
+    time.sleep(0.1)
     os.kill(worker(launcher, 1), signal.SIGKILL)
     errors = ends_as(uninterrupted, folder, launcher)
     assert "Another process of this run has ended" in errors and "Traceback" not in errors

@@ -298,7 +298,7 @@ GOOD = {
     ({diagnose.REWARDS: 0.1}, "does not know the rewards"),
     ({diagnose.DEVIATION: 0.01, diagnose.REWARDS: -7}, "the same whatever it sees"),
     ({diagnose.EXPECTED: 1}, "see ends coming"),
-    ({diagnose.EXPECTED: 0}, "Nothing stands out"),  # a dreamer arm's: it has no model of ends
+    ({diagnose.EXPECTED: 0}, "see ends coming"),
     ({diagnose.OUTLIVED: 0.7}, "outlive ends"),
     ({diagnose.OUTLIVED: 0.7, diagnose.ENDS: 1, diagnose.EXPECTED: 1}, "Nothing stands out"),
     ({diagnose.EXPECTED: 30}, "do not come"),
@@ -434,7 +434,8 @@ def test_networks_that_are_not_there_or_damaged_are_named_in_a_sentence(tmp_path
     options = [f"--{name.replace('_', '-')}={value}" for name, value in TINY.items()]
     folder = tmp_path / "run"
     command = train.parse(["--run-dir", str(folder), "--arm", "revised", *options])
-    train.new_run(command).lock.release()
+    with train.new_run(command).lock:
+        pass
     for arguments in (["--actor", "deterministic"], ["--device", "cuda"], ["--checkpoint", "best"]):
         (folder / "best.pt").write_bytes(b"x")
         assert play.main([str(folder), "--episodes", "1", *arguments]) == 2
@@ -444,8 +445,10 @@ def test_networks_that_are_not_there_or_damaged_are_named_in_a_sentence(tmp_path
     assert "not evaluated yet" in capsys.readouterr().err
     for name in CHECKPOINTS:  # as in the folders of results/, which keep the networks alone
         (folder / name).unlink(missing_ok=True)
-    assert play.main([str(folder)]) == 2
-    assert "--checkpoint best" in capsys.readouterr().err
+    for kept in (False, True):
+        assert play.main([str(folder)]) == 2
+        assert ("--checkpoint best" in capsys.readouterr().err) == kept
+        (folder / "best.pt").touch()
 
 
 @pytest.mark.parametrize("error, code", [
@@ -665,7 +668,8 @@ def test_committed_runs_are_of_this_programs_settings():
 
 
 # In 200 environment steps: less than half of what they earn. Random actions earn −220 on
-# HalfCheetah, and the others fall by then.
+# HalfCheetah, and fall with Hopper and Walker2D. With Ant they earn some 100: there this shows only
+# that the networks load, and that it does not fall as without actions.
 FLOOR = {
     "HopperBulletEnv-v0": 50, "Walker2DBulletEnv-v0": 50, "AntBulletEnv-v0": 30,
     "HalfCheetahBulletEnv-v0": -100,

@@ -256,6 +256,8 @@ def test_a_run_stores_what_happened_and_learns_when_it_is_due(tmp_path, monkeypa
     assert views == 2 * [("Told-v0", 1, 1.7, 0.4)]
     due = [0.2 + (0.0001 - 0.2) * step / 120 for step in (60, 80, 100, 120) for _ in range(3)]
     assert betas == pytest.approx(due)
+    (row,) = metrics(tmp_path / "run")
+    assert float(row["beta"]) == pytest.approx(np.mean(due), rel=1e-5)
     added = read_checkpoint(tmp_path / "run")[1]["kept"]["saved_rows"]
     replay = train.Replay(500_000, 2, tmp_path / "run" / "replay.bin")
     stored = np.frombuffer(b"".join(map(replay.read, range(added))), replay.dtype)
@@ -341,6 +343,7 @@ def kill_and_resume(folder: Path, kills: int, arguments: list) -> int:
         until(lambda before=before: written(folder) != before, process)
         time.sleep(delays.uniform(0, 0.2))
         assert not (folder / "weights.pt").exists(), "it ended before it was killed often enough"
+        assert process.poll() is None, process.communicate()[1]
     _, errors = process.communicate()
     assert process.returncode == 0, errors
     return killed
