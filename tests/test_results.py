@@ -687,7 +687,7 @@ def test_the_networks_of_the_whole_runs_still_do_what_they_learnt():
 
 def test_committed_runs_of_the_old_view_are_whole():
     paths = list(RESULTS.glob("old_view/**/settings.json"))
-    assert len(paths) == 27
+    assert len(paths) == 28
     for path in paths:
         last = path.with_name("metrics.csv").read_text().splitlines()[-1]
         assert int(last.split(",")[0]) >= json.loads(path.read_text())["steps"], path
