@@ -807,6 +807,11 @@ def whole_checkpoints(folder: Path) -> Iterator[tuple[tuple, Path, dict]]:
     raise ValueError(f"{folder} holds no whole checkpoint: start a new run in another folder.")
 
 
+def has_checkpoint(folder: Path) -> bool:
+    """Whether a folder holds a checkpoint, whole or not."""
+    return any((folder / name).exists() for name in CHECKPOINTS)
+
+
 def take(networks: nn.Module, weights: dict[str, Tensor]) -> None:
     """Load what was saved. A ValueError, in one sentence, if it is of other networks."""
     try:
@@ -978,7 +983,7 @@ def resumed_run(command: Command) -> Run:
         raise ValueError("--resume keeps the run's own run_dir: leave out --run-dir.")
     s, folder = check(command.settings.to_json()), folder_named(command.resume)
     run = Run(s, folder, command.device, command.precision)
-    if not any((run.own / name).exists() for name in CHECKPOINTS):
+    if not has_checkpoint(run.own):
         whose = f" of {processes()} processes" if rank() else ""
         raise ValueError(f"{folder} holds no whole checkpoint{whose}: it cannot go on.")
     run.open()

@@ -132,9 +132,12 @@ def measure(agent: Agent, name: str, episode: Episode) -> dict[str, np.ndarray]:
     unknown = 0 if episode.terminated else int(np.log(0.05) / np.log(min(s.gamma, 0.999)))
     known = slice(0, max(0, len(rewards) - unknown))
     ended = np.append(np.zeros(len(rewards) - 1), episode.terminated)
+    ends = 1 - model.predict_continues(states[1:])
+    if model.termination is None:  # it expects none, and cannot: no figure of it says anything
+        ends.fill_(torch.nan)
     said = {
         "reward": (model.predict_reward(states[1:]), rewards),
-        "terminated": (1 - model.predict_continues(states[1:]), ended),
+        "terminated": (ends, ended),
         "return": (believed[known], discounted(rewards, s.gamma)[known]),
     }
     found = {key: np.stack([p.cpu().numpy(), real], -1) for key, (p, real) in said.items()}
@@ -331,13 +334,13 @@ VERDICTS = (
     (lambda of: of[REWARDS] < 0.3,
      "the model does not know the rewards that it is shown: more prefill, or weigh rewards more."),
     # A single end may be of a rare kind.
-    (lambda of: of[ENDS] >= 3 and of.get(EXPECTED, of[ENDS]) < 0.5 * of[ENDS],
+    (lambda of: of[ENDS] >= 3 and of[EXPECTED] < 0.5 * of[ENDS],
      "the model does not see ends coming: weigh terminations more."),
     # Hopper and Walker2D had 0.59 to 0.83 when they did not stand.
     (lambda of: of[ENDS] >= 3 and of.get(OUTLIVED, 0) > 0.6,
      "dreams outlive ends that came: nothing is feared; try a higher --termination-weight."),
     # At 0.005 a decision, dreams lose half as much again of what is far off as by γ = 0.99.
-    (lambda of: of.get(EXPECTED, 0) > 2 * of[ENDS] + 0.005 * of[DECISIONS],
+    (lambda of: of[EXPECTED] > 2 * of[ENDS] + 0.005 * of[DECISIONS],
      "the model expects ends that do not come: nothing far off counts in its dreams."),
     # Of what is promised too much: are the dreams wrong, or what the critic makes of them?
     (lambda of: exceeds(of, PROMISED, EARNED) and exceeds(of, OWN, TAKEN),
@@ -372,8 +375,6 @@ def diagnose(command: argparse.Namespace) -> Path:
     for name in agent.actors:
         played[name], found[name] = play_all(agent, env, name, alive, command.episodes)
         named[name] = figures(found[name], played[name])
-        if agent.model.termination is None:
-            del named[name][EXPECTED]
     print(f"{s.env}, arm {s.arm}, networks {networks}")
     print(f"{'':78}" + "".join(f"{name:>15}" for name in named))
     for key in dict.fromkeys(itertools.chain(*named.values())):

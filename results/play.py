@@ -34,7 +34,7 @@ def load(folder: Path, checkpoint: str, device: str):
     env = train.make_env_of(s)
     agent = train.make_agent(s, env, device, "float32")  # as it acts, see actors.act
     if checkpoint == "newest":
-        if not any((folder / name).exists() for name in train.CHECKPOINTS):
+        if not train.has_checkpoint(folder):
             best = ": --checkpoint best plays its best.pt" if (folder / "best.pt").exists() else ""
             raise ValueError(f"{folder} holds no checkpoint{best}.")
         saved = train.read_checkpoint(folder)[1]
@@ -148,14 +148,11 @@ def exit_code(work: Callable[[], object]) -> int:
     """Does it: 0 done, 1 it failed, 2 bad input, 130 Ctrl-C; what was wrong, in one sentence."""
     try:
         work()
-    except (EnvironmentFault, FloatingPointError) as error:
-        print(error, file=sys.stderr)
-        return 1
-    except (ValueError, OSError) as error:
-        print(error, file=sys.stderr)
-        return 2
     except KeyboardInterrupt:
         return 130
+    except (EnvironmentFault, FloatingPointError, ValueError, OSError) as error:
+        print(error, file=sys.stderr)
+        return 1 if isinstance(error, (EnvironmentFault, FloatingPointError)) else 2
     return 0
 
 

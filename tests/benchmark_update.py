@@ -11,6 +11,7 @@ CUDA device is, it is measured too. Not part of the default tests.
 """
 
 import ctypes
+import dataclasses
 import re
 import time
 from collections import defaultdict
@@ -24,7 +25,7 @@ import torch.multiprocessing as mp
 from torch.utils.flop_counter import FlopCounterMode
 
 from actors import explore
-from env import Replay, make_env
+from env import Replay
 from train import (
     ARMS,
     PRESETS,
@@ -33,6 +34,7 @@ from train import (
     default_settings,
     has_bfloat16,
     keep_freed_memory,
+    make_env_of,
     update,
 )
 from world_model import TransposedConv2d
@@ -186,7 +188,7 @@ def test_processes(processes, threads, preset, benchmark, capsys, tmp_path):
 def test_collection(preset, benchmark, capsys):
     """Decisions a second within an episode: state, action, physics, rendering, replay."""
     s = default_settings("maxent", preset)
-    env = make_env("HalfCheetahBulletEnv-v0", s.action_repeat, s.camera_distance)
+    env = make_env_of(dataclasses.replace(s, env="HalfCheetahBulletEnv-v0"))
     agent = Agent(s, 6, CPU, bfloat16=has_bfloat16(CPU))
     replay, rng, state = Replay(1000, 6), np.random.default_rng(0), None
     replay.add(env.reset(seed=0)[0], is_first=True)

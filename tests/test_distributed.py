@@ -95,7 +95,7 @@ def free_nats(weight: float) -> float:
 
 
 CASES = {arm: tiny(arm, **STILL) for arm in ARMS} | {
-    "half the starts": tiny("maxent", starts=0.5, **STILL),
+    **{f"{arm}, half the starts": tiny(arm, starts=0.5, **STILL) for arm in ARMS},
     "blind": tiny("maxent", observe_first=False, **STILL),
     "half the images": tiny("maxent", decode_share=0.5, **STILL),
     "penalty": tiny("maxent", action_penalty=0.01, **STILL),
@@ -174,13 +174,13 @@ def apart(tmp_path_factory) -> Path:
     for worker in workers:
         worker.start()
     for worker in workers:
-        worker.join(600)
+        worker.join(120)
     assert [worker.exitcode for worker in workers] == [0, 9]
     return folder
 
 
 def test_a_process_that_dies_leaves_no_other_waiting(apart):
-    assert float((apart / "seconds").read_text()) < 60
+    assert float((apart / "seconds").read_text()) < 20
 
 
 @pytest.mark.parametrize("case", [*CASES, *MARGINS])
@@ -214,7 +214,7 @@ def test_an_infinite_loss_in_one_process_stops_both_and_changes_neither(apart):
         assert not math.isfinite(norm) and same
 
 
-@pytest.mark.parametrize("arm", ["dreamer", "maxent"])
+@pytest.mark.parametrize("arm", ARMS)
 def test_an_update_of_one_process_is_the_same_bit_for_bit_with_and_without_torchrun(arm, tmp_path):
     def after() -> tuple[dict, dict]:
         agent = make_agent(s)

@@ -106,6 +106,14 @@ def test_dreams_outlive_an_end_by_all_the_decisions_before_it(length, steps):
     assert "outlived" not in cut_off
 
 
+def test_of_an_agent_without_a_model_of_ends_it_is_not_said_that_it_expects_none():
+    s = Settings(**TINY, arm="dreamer", termination=False)
+    agent = Agent(s, actions=3, device=torch.device("cpu"), bfloat16=False)
+    episode = made_up_episode(30, terminated=True)
+    found = diagnose.measure(agent, "deterministic", episode)
+    assert np.isnan(diagnose.figures(found, [episode])[diagnose.EXPECTED])
+
+
 def test_open_loop_follows_the_actions_taken():
     torch.manual_seed(0)
     agent = Agent(Settings(**TINY), actions=3, device=torch.device("cpu"), bfloat16=False)
@@ -299,6 +307,7 @@ GOOD = {
     ({diagnose.DEVIATION: 0.01, diagnose.REWARDS: -7}, "the same whatever it sees"),
     ({diagnose.EXPECTED: 1}, "see ends coming"),
     ({diagnose.EXPECTED: 0}, "see ends coming"),
+    ({diagnose.EXPECTED: np.nan}, "Nothing stands out"),  # a dreamer arm's: it has no model of ends
     ({diagnose.OUTLIVED: 0.7}, "outlive ends"),
     ({diagnose.OUTLIVED: 0.7, diagnose.ENDS: 1, diagnose.EXPECTED: 1}, "Nothing stands out"),
     ({diagnose.EXPECTED: 30}, "do not come"),

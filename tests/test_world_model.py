@@ -181,7 +181,7 @@ def test_image_loss_of_a_share_of_the_images_is_that_of_all_on_average(observe_f
             for seed in range(60)
         ])  # fmt: skip
     assert {len(each) for each in drawn} == {6}
-    assert 0 < abs(errors.mean()) < 3 * errors.std() / 60**0.5 < 0.2 * drawn[0].mean()
+    assert 0 < abs(errors.mean()) < 3 * errors.std() / 60**0.5 < 0.1 * drawn[0].mean()
 
 
 def test_image_loss_plus_the_log_density_is_the_same_for_every_reconstruction():
