@@ -22,7 +22,12 @@ from torch import Tensor, nn
 
 
 class Mixture(NamedTuple):
-    """A mixture of K diagonal Gaussians over states, for each of N given states; float32."""
+    """A mixture of K diagonal Gaussians over states, for each of N given states; float32.
+
+    Its states are about 0 and of about unit size, as h and z are; scale others, lest the floor
+    under σ and rounding in `log_prob` count. Another density needs the same two methods and
+    `log_weights`: one that is no mixture has K = 1.
+    """
 
     log_weights: Tensor  # (N, K) log π, normalised
     mean: Tensor  # (N, K, D)
@@ -211,6 +216,7 @@ def particle_entropy(states: Tensor, continues: Tensor, gamma: float, k: int = 3
 
 @torch.no_grad()
 def soft_update(target: nn.Module, online: nn.Module, rate: float) -> None:
-    """θ_T ← (1 − λ) θ_T + λ θ, §4.1 (λ there is this rate, 0.1 in §5; it is not the λ of Eq. 5)."""
+    """θ_T ← (1 − λ) θ_T + λ θ, §4.1 (λ there is this rate, 0.1 in §5; it is not the λ of Eq. 5), of
+    parameters; buffers, which none here has, stay."""
     for old, new in zip(target.parameters(), online.parameters(), strict=True):
         old.lerp_(new, rate)

@@ -84,15 +84,15 @@ class Settings:
     checkpoint_minutes: Amount = 5.0  # between two checkpoints; 500 decisions make one too (ours)
     replay_capacity: Count = 500_000  # rows (decisions) of experience kept (ours)
     action_repeat: Size = 2  # environment steps per decision (Dreamer)
-    camera_distance: Amount = 1.7  # metres to a PyBullet robot; 3 is the environment's own (ours)
+    camera_distance: Amount = 1.7  # metres to a PyBullet robot that walks; its own is 3 (ours)
     floor_brightness: Share = 1.0  # factor on a PyBullet floor's texture; 1 is its own (ours)
 
     termination: bool = True  # §4.2: learn when episodes end, and let returns end there
     observe_first: bool = True  # §4.2: see o_0 before choosing a_0 (Dreamer's code does too)
-    fixed_prior: bool = True  # §4.2: KL to N(0, 1) and Jeffreys to the prior, not KL to the prior
+    fixed_prior: bool = True  # §4.2: KL to N(0, 1) and Jeffreys to the prior, not Dreamer's `kl`
     q_critic: bool = True  # §4.2 minor 1: the critic is Q(s, a), not V(s)
-    smooth_l1: bool = True  # §4.2 minor 2: Smooth L1 for reward and critic, not squared error
-    squared_reward: bool = False  # ½(r − r')² for rewards even with smooth_l1: a mean (ours)
+    smooth_l1: bool = True  # §4.2 minor 2: Smooth L1, not squared error, of critic and reward
+    squared_reward: bool = False  # but of the reward ½(r − r')², which learns its mean (ours)
     decode_stoch_only: bool = True  # §4.2 minor 3: the decoder sees z, not (h, z)
     first_state_only: bool = True  # §4.2: actors maximise the first imagined state's return alone
     entropy: bool = True  # §4.1: the stochastic actor also maximises β × entropy of future states
@@ -151,7 +151,7 @@ ORIGINAL = dict(
     termination=False, fixed_prior=False, q_critic=False, smooth_l1=False,
     decode_stoch_only=False, first_state_only=False, stoch=30, random_action=0.0,
 )
-ARMS = {  # what each curve of the paper's figure changes in `Settings`, whose own are `maxent`'s
+ARMS = {  # what each curve of the paper's figure changes in its preset, which is `maxent`'s
     "dreamer": ORIGINAL | dict(entropy=False, deterministic_actor=False, action_noise=0.3),
     "dreamer-maxent": ORIGINAL,
     "revised": dict(entropy=False, deterministic_actor=False, action_noise=0.3),

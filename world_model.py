@@ -4,7 +4,8 @@ Encoder, recurrent state-space model (RSSM), decoder, reward and termination hea
 
 It turns sequences of images into states s = (h, z) (`observe`), continues them without images under
 a policy (`imagine`), and says how wrong it is, as named terms (`WorldModel.loss`). It knows no
-actor, no setting and no optimiser.
+actor, no setting and no optimiser. In a process group `loss` is of all processes' rows together:
+each has to call it.
 
 Time is arrival-indexed. Row t of an episode holds the observation o_t, the action a_{t−1} that led
 to it, and the reward and termination received on arriving there; the first row has action 0 and
@@ -345,10 +346,11 @@ class WorldModel(nn.Module):
         h_{t+1} holds.
 
         Args:
-            batch: image (B, T, 64, 64, 3) uint8; action (B, T, A); the flags and reward (B, T).
+            batch: image (B, T, 64, 64, 3) uint8; action (B, T, A) and reward (B, T) float32;
+                is_first and terminated (B, T) bool.
 
         Returns:
-            the terms, and the posterior states (B, T, D).
+            the terms, and the posterior states (B, T, D), which hold their gradient.
         """
         observed = self.observe(batch["image"], batch["action"], batch["is_first"])
         arrived = (~batch["is_first"]).float()

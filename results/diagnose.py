@@ -360,7 +360,9 @@ def verdict(named: dict[str, dict[str, float]]) -> str:
         for holds, sentence in VERDICTS:
             if holds(of):
                 return f"Look first at the {name} actor: {sentence}"
-    return "Nothing stands out: the model is true to what these actors meet."
+    if all({PROMISED, AFTER} <= of.keys() for of in named.values()):
+        return "Nothing stands out: the model is true to what these actors meet."
+    return "Nothing stands out in what was measured; episodes are too short for returns or dreams."
 
 
 def diagnose(command: argparse.Namespace) -> Path:

@@ -31,7 +31,7 @@ from train import ARMS, Patient, default_settings, interval95
 
 # What may differ between runs of one line: who, where and how looked at, not what is learnt.
 NOT_LEARNT = {
-    "env", "seed", "eval_every", "eval_episodes", "eval_max_steps", "checkpoint_minutes",
+    "env", "seed", "eval_every", "eval_episodes", "checkpoint_minutes",
     "run_dir", "device", "precision",  # in files of before 2026-11-25
 }  # fmt: skip
 POLICIES = {"random": ":", "zero": "--", "constant": "-."}  # of reference.csv, and their lines

@@ -102,6 +102,16 @@ def test_two_seeds_are_not_enough_and_what_is_missing_is_named(capsys):
     assert "| Hopper | revised − dreamer: above 0 | 953.5 [948.0, 959.0] | 2, 2 | 100,000 |" in text
 
 
+def test_a_seed_that_was_run_twice_is_one_seed():
+    runs = made_up(dreamer=[1.0, 2, 3], revised=[950.0, 960, 970])
+    assert f"| 3, 3 | 100,000 | {SUPPORTED} |" in claims.report(runs, plot.read_reference())
+    for arms in runs.values():
+        again = {f"{seed}, again": run for seed, run in arms["revised"].items() if seed == "0"}
+        arms["revised"] = {"0": arms["revised"]["0"], "1": arms["revised"]["1"]} | again
+    text = claims.report(runs, plot.read_reference())
+    assert f"| 2, 3 | 100,000 | {OPEN} |" in text and "| 3, 3 |" not in text
+
+
 def test_runs_are_held_against_those_of_the_same_settings():
     """An arm run with other settings is no opponent; both with the same ones are."""
     runs = made_up(dreamer=[1.0, 2, 3], revised=[4.0, 5, 6])

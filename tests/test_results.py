@@ -332,9 +332,11 @@ def test_the_verdict_is_on_what_is_evaluated_before_the_explorer():
     assert "stochastic actor: the model does not know" in said
 
 
-def test_a_verdict_needs_no_figure_that_short_episodes_lack():
-    short = {k: v for k, v in GOOD.items() if k not in (diagnose.AFTER, diagnose.PROMISED)}
-    assert "Nothing stands out" in diagnose.verdict({"stochastic": short})
+@pytest.mark.parametrize("lacking", [diagnose.AFTER, diagnose.PROMISED])
+def test_a_verdict_needs_no_figure_that_short_episodes_lack_and_says_what_it_is_of(lacking):
+    short = {k: v for k, v in GOOD.items() if k != lacking}
+    assert "in what was measured" in diagnose.verdict({"stochastic": short})
+    assert "the model is true" in diagnose.verdict({"stochastic": GOOD})
 
 
 @pytest.fixture(scope="module")
