@@ -222,13 +222,14 @@ def as_numbers(metrics: dict[str, Tensor]) -> dict[str, float]:
 
 @torch.no_grad()
 def reward_r2(agent: "Agent", states: Tensor, batch: dict[str, Tensor]) -> Tensor:
-    """The share of the variance of a batch's rewards that its states (B, T, D) predict."""
+    """The share of the variance of a batch's rewards that its states (B, T, D) predict; 0 where
+    they do not vary."""
     first, reward = batch["is_first"], batch["reward"]
     weight = (agent.model.settled(first) & ~first).float()
     weight /= weight.sum().clamp(min=1)
     error = (weight * (agent.model.predict_reward(states) - reward).square()).sum()
     variance = (weight * (reward - (weight * reward).sum()).square()).sum()
-    return 1 - error / variance.clamp(min=1e-6)
+    return torch.where(variance > 1e-6, 1 - error / variance, 0.0)
 
 
 def live_rows(agent: "Agent", batch: dict[str, Tensor]) -> Tensor:
@@ -328,6 +329,7 @@ def train(run: "Run", stop: Callable[[], bool]) -> None:
             run.note_update(metrics, look)
         elif run.evaluation_due():
             run.report(evaluate(agent, run.eval_env, run.bar.set_postfix_str))
+            run.save()  # so that a run that goes on knows of each row, and of best.pt
         elif run.step < s.steps:
             if run.over:
                 replay.add(run.begin_episode(), is_first=True)
@@ -476,7 +478,8 @@ def join_processes() -> None:
         return
     devices, here = torch.cuda.device_count(), int(os.environ["LOCAL_WORLD_SIZE"])
     if 0 < devices < here:
-        raise ValueError(f"--nproc-per-node {here} is more than the {devices} CUDA devices.")
+        raise ValueError(f"--nproc-per-node {here} is more than the {devices} CUDA devices; "
+                         "CUDA_VISIBLE_DEVICES= hides them.")  # fmt: skip
     if devices:
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
     store, number, size = next(dist.rendezvous("env://"))
@@ -912,7 +915,8 @@ def check(text: str, where: str = "") -> Settings:
     n, least = processes(), -(-s.prefill // s.train_every) * s.train_every  # the first that is due
     rows = s.prefill // s.action_repeat // n
     live = s.starts * s.batch_size * ((s.length - s.burn_in) // 2) / n  # that are no ends, at least
-    enough = s.density != "knn" or live >= 4
+    enough = s.density != "knn" or not s.entropy or live >= 4
+    ahead = min(s.ends_ahead, s.length - 1) if s.termination else 0
     for possible, sentence in (
         (s.batch_size % n == 0, f"--batch-size {s.batch_size} is no multiple of {n} processes"),
         (s.burn_in <= s.length - 2, f"--burn-in leaves fewer than two rows of --length {s.length}"),
@@ -921,6 +925,10 @@ def check(text: str, where: str = "") -> Settings:
         (s.steps >= least, f"--steps {s.steps} leaves no update after --prefill: give {least}"),
         (s.eval_every >= s.train_every, f"--eval-every is less than --train-every {s.train_every}"),
         (enough, "--density knn needs four states to dream from: raise --batch-size or --length"),
+        (
+            not ahead or s.burn_in + ahead < s.length,
+            f"--ends-ahead {s.ends_ahead} and --burn-in leave no dream in a --length of {s.length}",
+        ),
     ):
         if not possible:
             raise ValueError(f"{where}{sentence}.")
@@ -986,6 +994,8 @@ def resumed_run(command: Command) -> Run:
     if not has_checkpoint(run.own):
         whose = f" of {processes()} processes" if rank() else ""
         raise ValueError(f"{folder} holds no whole checkpoint{whose}: it cannot go on.")
+    if (folder / f"rank-{processes()}").exists():
+        raise ValueError(f"{folder} is a run of more processes than {processes()}: give it all.")
     run.open()
     run.load()
     run.sign()

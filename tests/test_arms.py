@@ -741,6 +741,8 @@ def test_reward_r2_is_one_of_exact_predictions_and_leaves_first_rows_out():
     mean = batch["reward"][~batch["is_first"]].mean()
     agent.model.predict_reward = lambda states: mean
     assert reward_r2(agent, states, batch).item() == pytest.approx(0, abs=1e-6)
+    batch["reward"][~batch["is_first"]] = 2  # of a robot that is paid for each step: no variance
+    assert reward_r2(agent, states, batch).item() == 0
 
 
 def test_reward_r2_and_dreams_leave_rows_out_that_are_not_settled():

@@ -256,7 +256,7 @@ def test_what_an_environment_does_later_is_one_sentence_that_names_it(
 
 def test_nothing_is_said_to_be_saved_that_is_not(register, tmp_path, monkeypatch, capfd):
     def full(run):
-        if run.step:
+        if run.step > 60:  # an evaluation is saved
             raise OSError(28, "No space left on device")
         save(run)
 
@@ -432,6 +432,26 @@ def test_what_makes_a_run_what_it_is_cannot_be_changed(stub_run, capsys):
     assert contents(stub_run) == before
 
 
+def test_a_run_of_more_processes_is_not_gone_on_with_by_fewer(stub_run, capsys):
+    before, other = contents(stub_run), stub_run / "rank-1"
+    other.mkdir()
+    refused(["--resume", stub_run, "--steps", "180"], capsys, "more processes")
+    other.rmdir()
+    assert contents(stub_run) == before
+
+
+def test_each_evaluation_is_followed_by_a_checkpoint_that_knows_it(stub_run, monkeypatch):
+    """Else a run that ends before the next one has a best.pt that no row speaks of."""
+    monkeypatch.setattr(train.Run, "save_if_due", lambda run: None)
+    saved = []
+    save = train.Run.save
+    monkeypatch.setattr(train.Run, "save", lambda run: (saved.append(len(run.rows)), save(run)))
+    before = len(metrics(stub_run))
+    assert train.main(["--resume", str(stub_run), "--steps", "240"]) == 0
+    rows = len(metrics(stub_run))
+    assert rows > before + 1 and saved == [*range(before + 1, rows + 1), rows]
+
+
 def test_a_rate_edited_in_settings_json_is_said(stub_run, capsys):
     path = stub_run / "settings.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"model_lr": 1e-5}), "utf-8-sig")
@@ -590,7 +610,7 @@ def test_a_damaged_checkpoint_is_put_aside_and_what_is_gone_on_from_is_said(stub
     (stub_run / "checkpoint.pt").mkdir()
     assert train.main(["--resume", str(stub_run)]) == 0
     said = capsys.readouterr()
-    assert "checkpoint.pt is damaged" in said.err and "from step 0" in said.out
+    assert "checkpoint.pt is damaged" in said.err and "from step 120" in said.out
     assert (stub_run / "checkpoint.damaged").is_dir() and (stub_run / "checkpoint.pt").is_file()
 
 
