@@ -123,18 +123,17 @@ def find_spec(env_id: str) -> gym.envs.registration.EnvSpec:
 
 
 def set_up_pybullet(robot: gym.Env, camera_distance: float | None, floor_brightness: float) -> None:
-    """Loads a PyBullet robot's world, with the camera at a distance in metres from a robot that
-    walks (None: its own) and a factor on the floor's texture. Its bright checkerboard is most of
-    the image loss, yet the only cue of forward speed: dim it, but leave it to be seen."""
+    """Loads a PyBullet robot's world, with the camera at a distance in metres (None: its own) and
+    a factor on the floor's texture. Its bright checkerboard is most of the image loss, yet the only
+    cue of forward speed: dim it, but leave it to be seen."""
     robot._render_width = robot._render_height = IMAGE_SIZE  # never resized from 320×240
+    if camera_distance is not None:
+        robot._cam_dist = camera_distance
     # Its world is loaded at the first reset and restored at later ones, with other contacts: after
     # this one, an episode is a function of its seed and actions alone, in this process or in one
     # that resumes it.
     with silence():
         robot.reset(seed=0)
-    # The camera follows a body that walks; a pendulum it would look at from too near.
-    if camera_distance is not None and hasattr(robot.robot, "body_real_xyz"):
-        robot._cam_dist = camera_distance
     if floor_brightness == 1.0:
         return
     for i in range(robot._p.getNumBodies()):

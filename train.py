@@ -81,10 +81,10 @@ class Settings:
     eval_every: Count = 5_000  # environment steps between evaluations, once training began (ours)
     eval_episodes: Size = 10  # episodes per evaluation (§5: 10)
     eval_max_steps: Count = 10_000  # environment steps after which one of them is ended (ours)
-    checkpoint_minutes: Amount = 5.0  # between two checkpoints; 500 decisions make one too (ours)
+    checkpoint_minutes: Amount = 5.0  # between two; 500 decisions, evaluations make one too (ours)
     replay_capacity: Count = 500_000  # rows (decisions) of experience kept (ours)
     action_repeat: Size = 2  # environment steps per decision (Dreamer)
-    camera_distance: Amount = 1.7  # metres to a PyBullet robot that walks; its own is 3 (ours)
+    camera_distance: Amount = 1.7  # metres to a PyBullet robot; its own, 3, suits pendulums (ours)
     floor_brightness: Share = 1.0  # factor on a PyBullet floor's texture; 1 is its own (ours)
 
     termination: bool = True  # §4.2: learn when episodes end, and let returns end there
@@ -92,7 +92,7 @@ class Settings:
     fixed_prior: bool = True  # §4.2: KL to N(0, 1) and Jeffreys to the prior, not Dreamer's `kl`
     q_critic: bool = True  # §4.2 minor 1: the critic is Q(s, a), not V(s)
     smooth_l1: bool = True  # §4.2 minor 2: Smooth L1, not squared error, of critic and reward
-    squared_reward: bool = False  # but of the reward ½(r − r')², which learns its mean (ours)
+    squared_reward: bool = False  # ½(r − r')² of the reward even with smooth_l1: a mean (ours)
     decode_stoch_only: bool = True  # §4.2 minor 3: the decoder sees z, not (h, z)
     first_state_only: bool = True  # §4.2: actors maximise the first imagined state's return alone
     entropy: bool = True  # §4.1: the stochastic actor also maximises β × entropy of future states
@@ -151,7 +151,7 @@ ORIGINAL = dict(
     termination=False, fixed_prior=False, q_critic=False, smooth_l1=False,
     decode_stoch_only=False, first_state_only=False, stoch=30, random_action=0.0,
 )
-ARMS = {  # what each curve of the paper's figure changes in its preset, which is `maxent`'s
+ARMS = {  # what each curve of the paper's figure changes in a preset, whose own are `maxent`'s
     "dreamer": ORIGINAL | dict(entropy=False, deterministic_actor=False, action_noise=0.3),
     "dreamer-maxent": ORIGINAL,
     "revised": dict(entropy=False, deterministic_actor=False, action_noise=0.3),
@@ -223,7 +223,7 @@ def as_numbers(metrics: dict[str, Tensor]) -> dict[str, float]:
 @torch.no_grad()
 def reward_r2(agent: "Agent", states: Tensor, batch: dict[str, Tensor]) -> Tensor:
     """The share of the variance of a batch's rewards that its states (B, T, D) predict; 0 where
-    they do not vary."""
+    they hardly vary."""
     first, reward = batch["is_first"], batch["reward"]
     weight = (agent.model.settled(first) & ~first).float()
     weight /= weight.sum().clamp(min=1)
@@ -479,7 +479,7 @@ def join_processes() -> None:
     devices, here = torch.cuda.device_count(), int(os.environ["LOCAL_WORLD_SIZE"])
     if 0 < devices < here:
         raise ValueError(f"--nproc-per-node {here} is more than the {devices} CUDA devices; "
-                         "CUDA_VISIBLE_DEVICES= hides them.")  # fmt: skip
+                         "with CUDA_VISIBLE_DEVICES= before it, CPUs compute.")  # fmt: skip
     if devices:
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
     store, number, size = next(dist.rendezvous("env://"))
@@ -925,11 +925,9 @@ def check(text: str, where: str = "") -> Settings:
         (s.steps >= least, f"--steps {s.steps} leaves no update after --prefill: give {least}"),
         (s.eval_every >= s.train_every, f"--eval-every is less than --train-every {s.train_every}"),
         (enough, "--density knn needs four states to dream from: raise --batch-size or --length"),
-        (
-            not ahead or s.burn_in + ahead < s.length,
-            f"--ends-ahead {s.ends_ahead} and --burn-in leave no dream in a --length of {s.length}",
-        ),
-    ):
+        (not ahead or s.burn_in + ahead < s.length,
+         f"--burn-in and --ends-ahead {ahead} need a --length above {s.burn_in + ahead}"),
+    ):  # fmt: skip
         if not possible:
             raise ValueError(f"{where}{sentence}.")
     return s
@@ -995,7 +993,8 @@ def resumed_run(command: Command) -> Run:
         whose = f" of {processes()} processes" if rank() else ""
         raise ValueError(f"{folder} holds no whole checkpoint{whose}: it cannot go on.")
     if (folder / f"rank-{processes()}").exists():
-        raise ValueError(f"{folder} is a run of more processes than {processes()}: give it all.")
+        raise ValueError(f"{folder} was made by more processes than {processes()}: go on with as "
+                         "many (torchrun --nproc-per-node).")  # fmt: skip
     run.open()
     run.load()
     run.sign()

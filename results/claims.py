@@ -12,10 +12,12 @@ that the explorer covers more of the environment's own states.
 
 import argparse
 import sys
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
+
+import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from results import plot
@@ -88,11 +90,20 @@ def changes(label: str) -> tuple[str, frozenset[str]]:
     return arm, frozenset(changed)
 
 
-def choose(arms: dict, name: str, common: frozenset[str]) -> list[tuple[str, dict]]:
-    """Seed and run, of an arm with a change of its own or none, beside those common to all."""
+def choose(arms: dict, name: str, common: frozenset[str]) -> list[list[dict]]:
+    """Each seed's runs, of an arm with a change of its own or none, beside those common to all."""
     arm, own = changes(name)
-    fitting = (runs for label, runs in arms.items() if changes(label) == (arm, own | common))
-    return [(each.partition(",")[0], run) for runs in fitting for each, run in runs.items()]
+    seeds = defaultdict(list)
+    for label, runs in arms.items():
+        if changes(label) == (arm, own | common):
+            for each, run in runs.items():
+                seeds[each.partition(",")[0]].append(run)
+    return list(seeds.values())
+
+
+def means(seeds: list[list[dict]], what: Callable, end: float) -> list[float]:
+    """What each seed has up to a step: one that was run twice is one sample."""
+    return [float(np.mean([what(run, end) for run in runs])) for runs in seeds]
 
 
 def compare(comparison: Comparison, arms: dict, common, reference) -> tuple[str, ...]:
@@ -102,15 +113,15 @@ def compare(comparison: Comparison, arms: dict, common, reference) -> tuple[str,
     runs = {name: choose(arms, name, common) for name in signs}
     if missing := [name for name, of in runs.items() if not of]:
         return comparison.lies, "–", "; ".join(f"no {name}" for name in missing), "–", OPEN
-    end = min(run["env_steps"][-1] for of in runs.values() for _, run in of)
+    end = min(run["env_steps"][-1] for of in runs.values() for seed in of for run in seed)
     blind = {p: float(reference[env, p]["return"]) for p in plot.POLICIES}
     shift = comparison.signs.get(BLIND, 0) * max(blind.values())
-    samples = [[comparison.what(run, end) for _, run in of] for of in runs.values()]
+    samples = [means(of, comparison.what, end) for of in runs.values()]
     found = [x + shift for x in over_seeds(*samples, signs=tuple(signs.values()))]
     chosen = [choose(arms, arm, common) for arm in ARMS]
-    best = max(iqm([score(run, end) for _, run in of]) for of in chosen if of)
+    best = max(iqm(means(of, score, end)) for of in chosen if of)
     margin = MARGIN * max(0.0, best - blind["random"])
-    seeds = [len({seed for seed, _ in of}) for of in runs.values()]  # one, run twice, is one
+    seeds = [len(of) for of in runs.values()]
     said = OPEN if min(seeds) < LEAST else verdict(*found[1:], comparison.lies, margin)
     bound = {"above": "0", "within": f"±{margin:.3g}", "not above": f"{margin:.3g}"}
     where = f"{comparison.lies} {bound[comparison.lies]}"

@@ -29,7 +29,8 @@ sys.path.insert(0, str(HERE.parent))
 from results.baseline import COLUMNS, USUAL
 from train import ARMS, Patient, default_settings, interval95
 
-# What may differ between runs of one line: who, where and how looked at, not what is learnt.
+# What may differ between runs of one line: who, where and how looked at, not what is learnt, nor
+# `eval_max_steps`, on which returns depend.
 NOT_LEARNT = {
     "env", "seed", "eval_every", "eval_episodes", "checkpoint_minutes",
     "run_dir", "device", "precision",  # in files of before 2026-11-25

@@ -110,6 +110,7 @@ def test_a_seed_that_was_run_twice_is_one_seed():
         arms["revised"] = {"0": arms["revised"]["0"], "1": arms["revised"]["1"]} | again
     text = claims.report(runs, plot.read_reference())
     assert f"| 2, 3 | 100,000 | {OPEN} |" in text and "| 3, 3 |" not in text
+    assert "| 953.0 [" in text  # (950 + 960) / 2 − 2
 
 
 def test_runs_are_held_against_those_of_the_same_settings():

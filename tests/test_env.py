@@ -223,12 +223,6 @@ def test_camera_distance_moves_the_camera_and_none_leaves_it(make):
     assert not np.array_equal(images[0], images[2])
 
 
-def test_a_pendulum_which_no_camera_follows_is_seen_from_its_own_distance(make):
-    name = "InvertedDoublePendulumBulletEnv-v0"
-    own, asked = (make(name, camera_distance=d).reset(seed=0)[0] for d in (None, 1.7))
-    assert np.array_equal(own, asked)
-
-
 # --- toy environments ---
 
 

@@ -606,10 +606,16 @@ def test_settings_that_are_none_are_refused(text, stub_run, capsys):
 
 
 def test_a_damaged_checkpoint_is_put_aside_and_what_is_gone_on_from_is_said(stub_run, capsys):
-    (stub_run / "checkpoint.pt").unlink()
-    (stub_run / "checkpoint.pt").mkdir()
+    newest, older = stub_run / "checkpoint.pt", (stub_run / "checkpoint.pt").read_bytes()
+    assert train.main(["--resume", str(stub_run), "--steps", "180"]) == 0
+    before = metrics(stub_run)
+    (stub_run / "checkpoint.previous.pt").write_bytes(older)
+    newest.unlink()
+    newest.mkdir()
+    capsys.readouterr()
     assert train.main(["--resume", str(stub_run)]) == 0
     said = capsys.readouterr()
+    assert metrics(stub_run) == before and before[-1]["env_steps"] == "180"
     assert "checkpoint.pt is damaged" in said.err and "from step 120" in said.out
     assert (stub_run / "checkpoint.damaged").is_dir() and (stub_run / "checkpoint.pt").is_file()
 

@@ -533,9 +533,10 @@ def test_a_run_with_a_switch_of_its_own_is_another_line(tmp_path):
     write_run(tmp_path / "b", "3 5", seed=1, checkpoint_minutes=1.0)
     write_run(tmp_path / "c", "7", seed=1, q_critic=False, preset="paper")
     write_run(tmp_path / "d", "")  # not yet evaluated: left out
+    write_run(tmp_path / "e", "9", eval_max_steps=500)  # its returns are of other episodes
     runs = plot.read_runs(tmp_path)["HopperBulletEnv-v0"]
     assert sorted(runs["maxent"]) == ["0", "1"]
-    (other,) = runs.keys() - {"maxent"}
+    (other,) = runs.keys() - {"maxent", "maxent, eval_max_steps 500"}
     assert other.startswith("maxent, preset paper") and "q_critic False" in other
 
 

@@ -1,6 +1,7 @@
 """The whole program, as its user meets it: real PyBullet steps, bad input, kills and faults."""
 
 import csv
+import dataclasses
 import errno
 import json
 import os
@@ -25,7 +26,16 @@ from scipy import stats
 
 import actors
 import train
-from train import ARMS, Agent, Settings, has_bfloat16, main, read_checkpoint
+from train import (
+    ARMS,
+    Agent,
+    Settings,
+    check,
+    default_settings,
+    has_bfloat16,
+    main,
+    read_checkpoint,
+)
 
 TRAIN = Path(__file__).parent.parent / "train.py"
 TINY = (
@@ -543,6 +553,14 @@ def test_bad_input_ends_with_one_sentence_and_code_2_and_nothing_written(
     said = capsys.readouterr().err
     assert one_sentence(said) and BAD[arguments] in said, said
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("arm, unused", [
+    ("revised", dict(density="knn", batch_size=1)), ("dreamer", dict(length=7)),  # no ends
+])  # fmt: skip
+def test_what_an_arm_does_not_use_is_not_refused(arm, unused):
+    s = dataclasses.replace(default_settings(arm), **unused)
+    assert check(s.to_json()) == s
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a CUDA device is here")
