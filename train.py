@@ -329,7 +329,6 @@ def train(run: "Run", stop: Callable[[], bool]) -> None:
             run.note_update(metrics, look)
         elif run.evaluation_due():
             run.report(evaluate(agent, run.eval_env, run.bar.set_postfix_str))
-            run.save()  # so that a run that goes on knows of each row, and of best.pt
         elif run.step < s.steps:
             if run.over:
                 replay.add(run.begin_episode(), is_first=True)
@@ -687,9 +686,11 @@ class Run:
         return self.seconds + time.monotonic() - self.clock
 
     def save_if_due(self) -> None:
-        """Write a checkpoint every `checkpoint_minutes`, and before the ring's reserve is full."""
+        """Write a checkpoint every `checkpoint_minutes`, before the ring's reserve is full, and
+        after an evaluation, so that a run which goes on knows of each row and of best.pt."""
         waited = time.monotonic() - self.clock >= 60 * self.s.checkpoint_minutes
-        if any(gathered(waited or self.replay.added - self.saved_rows >= self.replay.save_every)):
+        full = self.replay.added - self.saved_rows >= self.replay.save_every
+        if any(gathered(waited or full or self.evaluated_at == self.step)):
             self.save()
 
     def save(self) -> None:

@@ -442,7 +442,6 @@ def test_a_run_of_more_processes_is_not_gone_on_with_by_fewer(stub_run, capsys):
 
 def test_each_evaluation_is_followed_by_a_checkpoint_that_knows_it(stub_run, monkeypatch):
     """Else a run that ends before the next one has a best.pt that no row speaks of."""
-    monkeypatch.setattr(train.Run, "save_if_due", lambda run: None)
     saved = []
     save = train.Run.save
     monkeypatch.setattr(train.Run, "save", lambda run: (saved.append(len(run.rows)), save(run)))

@@ -336,6 +336,7 @@ def test_the_verdict_is_on_what_is_evaluated_before_the_explorer():
 def test_a_verdict_needs_no_figure_that_short_episodes_lack_and_says_what_it_is_of(lacking):
     short = {k: v for k, v in GOOD.items() if k != lacking}
     assert "in what was measured" in diagnose.verdict({"stochastic": short})
+    assert "in what was measured" in diagnose.verdict({"stochastic": short, "deterministic": GOOD})
     assert "the model is true" in diagnose.verdict({"stochastic": GOOD})
 
 
