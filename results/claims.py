@@ -12,16 +12,14 @@ that the explorer covers more of the environment's own states.
 
 import argparse
 import sys
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from results import plot
-from results.plot import covered, iqm, over_seeds, score
+from results.plot import by_seed, covered, iqm, over_seeds, score
 from train import ARMS, Patient
 
 LEAST = 3  # seeds: of two against two, one pair is above the other by chance once in six
@@ -90,20 +88,12 @@ def changes(label: str) -> tuple[str, frozenset[str]]:
     return arm, frozenset(changed)
 
 
-def choose(arms: dict, name: str, common: frozenset[str]) -> list[list[dict]]:
-    """Each seed's runs, of an arm with a change of its own or none, beside those common to all."""
+def choose(arms: dict, name: str, common: frozenset[str]) -> list[tuple[str, dict]]:
+    """The runs of an arm with a change of its own or none, beside those common to all, each with
+    its seed."""
     arm, own = changes(name)
-    seeds = defaultdict(list)
-    for label, runs in arms.items():
-        if changes(label) == (arm, own | common):
-            for each, run in runs.items():
-                seeds[each.partition(",")[0]].append(run)
-    return list(seeds.values())
-
-
-def means(seeds: list[list[dict]], what: Callable, end: float) -> list[float]:
-    """What each seed has up to a step: one that was run twice is one sample."""
-    return [float(np.mean([what(run, end) for run in runs])) for runs in seeds]
+    fitting = (runs for label, runs in arms.items() if changes(label) == (arm, own | common))
+    return [each for runs in fitting for each in runs.items()]
 
 
 def compare(comparison: Comparison, arms: dict, common, reference) -> tuple[str, ...]:
@@ -113,15 +103,15 @@ def compare(comparison: Comparison, arms: dict, common, reference) -> tuple[str,
     runs = {name: choose(arms, name, common) for name in signs}
     if missing := [name for name, of in runs.items() if not of]:
         return comparison.lies, "–", "; ".join(f"no {name}" for name in missing), "–", OPEN
-    end = min(run["env_steps"][-1] for of in runs.values() for seed in of for run in seed)
+    end = min(run["env_steps"][-1] for of in runs.values() for _, run in of)
     blind = {p: float(reference[env, p]["return"]) for p in plot.POLICIES}
     shift = comparison.signs.get(BLIND, 0) * max(blind.values())
-    samples = [means(of, comparison.what, end) for of in runs.values()]
+    samples = [by_seed(of, comparison.what, end) for of in runs.values()]
     found = [x + shift for x in over_seeds(*samples, signs=tuple(signs.values()))]
     chosen = [choose(arms, arm, common) for arm in ARMS]
-    best = max(iqm(means(of, score, end)) for of in chosen if of)
+    best = max(iqm(by_seed(of, score, end)) for of in chosen if of)
     margin = MARGIN * max(0.0, best - blind["random"])
-    seeds = [len(of) for of in runs.values()]
+    seeds = [len(sample) for sample in samples]
     said = OPEN if min(seeds) < LEAST else verdict(*found[1:], comparison.lies, margin)
     bound = {"above": "0", "within": f"±{margin:.3g}", "not above": f"{margin:.3g}"}
     where = f"{comparison.lies} {bound[comparison.lies]}"

@@ -16,6 +16,7 @@ import json
 import sys
 import textwrap
 from collections import defaultdict
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import matplotlib as mpl
@@ -188,6 +189,15 @@ def covered(run: dict, end: float) -> float:
     return seen.mean() if seen.size else float("nan")
 
 
+def by_seed(runs: Iterable[tuple[str, dict]], what: Callable, end: float) -> list[float]:
+    """What each seed has up to a step, of runs by their names: one that was run twice is one
+    sample, the mean of its runs."""
+    seeds = defaultdict(list)
+    for name, run in runs:
+        seeds[name.partition(",")[0]].append(what(run, end))
+    return [float(np.mean(found)) for found in seeds.values()]
+
+
 def iqm(values: np.ndarray, axis: int = -1) -> np.ndarray:
     """Interquartile mean: without a quarter of the values at either end, rounded down (Agarwal et
     al. 2021); of fewer than four, the mean."""
@@ -261,13 +271,12 @@ def minutes_to(run: dict, goal: float | None) -> str:
 
 def rows_of_all(runs: dict[str, dict]) -> list[str]:
     """The row of a group of seeds, up to where all of them are; none of a single one."""
-    if len(runs) == 1:
-        return []
     end = min(run["env_steps"][-1] for run in runs.values())
-    earned, seen = (
-        shown(over_seeds([of(run, end) for run in runs.values()])) for of in (score, covered)
-    )
-    return [f"**IQM of {len(runs)}** | {end:,.0f} | – | – | – | {earned} | – | {seen} | –"]
+    scores, covers = (by_seed(runs.items(), what, end) for what in (score, covered))
+    if len(scores) == 1:
+        return []
+    earned, seen = shown(over_seeds(scores)), shown(over_seeds(covers))
+    return [f"**IQM of {len(scores)}** | {end:,.0f} | – | – | – | {earned} | – | {seen} | –"]
 
 
 def main(arguments: list[str]) -> int:

@@ -564,7 +564,11 @@ def test_two_runs_of_one_seed_are_two_lines_and_both_count(tmp_path, capsys):
     runs = plot.read_runs(tmp_path)["HopperBulletEnv-v0"]["maxent"]
     assert list(runs) == ["0", "0, b/c/run", "0, b/run"]
     assert plot.main([str(tmp_path)]) == 0
-    assert "| 0, b/run |" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "| 0, b/run |" in out and "IQM" not in out  # of one seed
+    write_run(tmp_path / "d", "7 8", seed=1)
+    assert plot.main([str(tmp_path)]) == 0
+    assert "| **IQM of 2** | 10,000 | – | – | – | 4.8 [1.8, 7.8] |" in capsys.readouterr().out
 
 
 def drawn(axes_lines: dict[str, dict]) -> tuple[np.ndarray, np.ndarray]:
