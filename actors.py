@@ -54,7 +54,8 @@ class StochasticActor(nn.Module):
 
 
 class DeterministicActor(nn.Module):
-    """A(s) = tanh(5 tanh(x / 5)), trained beside the stochastic actor, evaluated for it (§4.1)."""
+    """A(s) = tanh(5 tanh(x / 5)), trained beside the stochastic actor and evaluated in its place
+    (§4.1)."""
 
     def __init__(self, size: int, actions: int, units: int):
         super().__init__()

@@ -43,13 +43,9 @@ class Mixture(NamedTuple):
         with torch.autocast(x.device.type, enabled=False):
             x = x.float().transpose(0, 1)  # (N, M, D)
             precision = self.std.pow(-2)
-            quadratic = torch.bmm(x.square(), precision.mT) - 2 * torch.bmm(
-                x, (self.mean * precision).mT
-            )  # (N, M, K)
-            constant = (
-                self.mean.square() * precision + 2 * self.std.log() + math.log(2 * math.pi)
-            ).sum(-1)
-            component = -0.5 * (quadratic + constant.unsqueeze(1))
+            quadratic = x.square() @ precision.mT - x @ (2 * self.mean * precision).mT  # (N, M, K)
+            constant = self.mean.square() * precision + 2 * self.std.log() + math.log(2 * math.pi)
+            component = -0.5 * (quadratic + constant.sum(-1).unsqueeze(1))
             return torch.logsumexp(self.log_weights.unsqueeze(1) + component, -1).T
 
     def sample_components(self) -> Tensor:

@@ -551,7 +551,7 @@ class Run:
         if processes() > 1:  # all begin with the first one's networks
             for value in self.agent.state_dict().values():
                 dist.broadcast(value, 0)
-        self.step = self.updates = self.episode = 0  # made; made; begun
+        self.step = self.updates = self.episode = 0  # steps and updates made, episodes begun
         self.over, self.length = True, 0  # whether the last episode ended; its environment steps
         self.explores, self.lead = True, 0  # who collects; by how many steps the explorer is ahead
         self.state: Tensor | None = None  # (1, D), the agent's; None: it has not looked yet
@@ -560,8 +560,8 @@ class Run:
         self.metrics: dict[str, list[float]] = {}  # of updates and whole episodes, since then
         self.rows: list[dict[str, str]] = []  # of metrics.csv
         self.evaluated_at, self.best = 0, -float("inf")  # step of the last one; best mean return
-        self.seconds, self.clock = 0.0, time.monotonic()  # taken until the last checkpoint; then
-        self.saved_rows = 0  # of the replay, then
+        self.seconds, self.clock = 0.0, time.monotonic()  # up to the last checkpoint; its time
+        self.saved_rows = 0  # added to the replay, at the last checkpoint
         precision = "bfloat16" if self.agent.bfloat16 else "float32"
         on_cuda = self.agent.device.type == "cuda"
         chip = torch.cuda.get_device_name() if on_cuda else torch.backends.cpu.get_cpu_capability()

@@ -231,7 +231,7 @@ class WorldModel(nn.Module):
         # Likewise one dense layer on (h, embedding).
         self.posterior_deter = nn.Linear(deter, hidden, bias=False)
         self.posterior_embed = nn.Linear(self.encoder.size, hidden)
-        self.posterior_out = Float32Linear(hidden, 2 * stoch)
+        self.posterior_out = nn.Linear(hidden, 2 * stoch)
         self.decoder = Decoder(stoch if decode_stoch_only else self.size, depth)
         self.reward = mlp(self.size, units, 2, 1)
         self.termination = mlp(self.size, units, 3, 1) if termination else None
@@ -309,12 +309,8 @@ class WorldModel(nn.Module):
             states.append(self.step(states[-1], actions[-1]))
             actions.append(policy(states[-1]))
         state = torch.stack(states)
-        return Dream(
-            state,
-            torch.stack(actions),
-            self.predict_reward(state[1:]),
-            self.predict_continues(state[1:]),
-        )
+        reward, continues = self.predict_reward(state[1:]), self.predict_continues(state[1:])
+        return Dream(state, torch.stack(actions), reward, continues)
 
     def predict_reward(self, state: Tensor) -> Tensor:
         """r(s): (…, D) -> (…), the reward for achieving the state."""

@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from results import plot
+from results.play import exit_code
 from results.plot import by_seed, covered, iqm, over_seeds, score
 from train import ARMS, Patient
 
@@ -164,21 +165,13 @@ def report(runs: dict, reference: dict) -> str:
 
 
 def main(arguments: list[str]) -> int:
-    """Runs a command line. Returns the exit code: 0 done, 2 bad input."""
+    """Runs a command line. Returns its `exit_code`."""
     says = "Holds the paper's claims against all runs below a folder."
     parser = argparse.ArgumentParser(prog="python results/claims.py", description=says)
     add, says = parser.add_argument, "where runs are, however deep (%(default)s)"
     add("folder", type=Path, nargs="?", default=plot.WHOLE, help=says)
     folder = parser.parse_args(arguments).folder
-    try:
-        runs = plot.read_runs(folder)
-        if not runs:
-            raise ValueError(f"{folder} holds no evaluated run: no claim can be judged.")
-        print(report(runs, plot.read_reference()), end="")
-    except (ValueError, OSError) as error:
-        print(error, file=sys.stderr)
-        return 2
-    return 0
+    return exit_code(lambda: print(report(plot.read_runs(folder), plot.read_reference()), end=""))
 
 
 if __name__ == "__main__":

@@ -187,7 +187,7 @@ def take_at_its_word(agent: Agent, env, name: str, episode: Episode, seed: int) 
 
     Returns:
         (M, 15, 2) dreamt and real reward of each of 15 decisions: dreamt, times survival until
-        then; real, 0 after an end. What a time limit cuts off is left out. None, M = 0, if the
+        then; real, 0 after an end. What a time limit cuts off is left out. No rows, M = 0, if the
         environment does not repeat itself.
     """
     last = len(episode.rewards) - (1 if episode.terminated else OPEN_LOOP)

@@ -67,7 +67,7 @@ def open_loop(agent: train.Agent, episode: Episode, frames: int, context: int = 
     frames = min(frames, len(episode.states))
     context = min(context, frames)
     actions = torch.from_numpy(episode.actions[context - 1 : frames - 1]).to(agent.device)
-    with torch.random.fork_rng():
+    with torch.random.fork_rng([agent.device] if agent.device.type == "cuda" else []):
         torch.manual_seed(0)
         start = episode.states[context - 1 : context]
         dreamt = agent.model.along(start, actions.unsqueeze(1))[1:, 0]

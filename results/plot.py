@@ -28,6 +28,7 @@ HERE = Path(__file__).parent
 WHOLE = HERE / "whole"  # the runs of this repository
 sys.path.insert(0, str(HERE.parent))
 from results.baseline import COLUMNS, USUAL
+from results.play import exit_code
 from train import ARMS, Patient, default_settings, interval95
 
 # What may differ between runs of one line: who, where and how looked at, not what is learnt, nor
@@ -79,7 +80,8 @@ def read_metrics(path: Path) -> dict[str, np.ndarray]:
 def read_runs(folder: Path) -> dict[str, dict[str, dict[str, dict[str, np.ndarray]]]]:
     """{env: {label: {name: {column: values}}}} of each run below a folder, named by its seed; a
     second one of a seed also by its folder. Runs without an evaluation are left out, and what is no
-    run is, with a word. So are those of an old_view, which is a figure of its own."""
+    run is, with a word. So are those of an old_view, which is a figure of its own. A ValueError if
+    none is left."""
     runs = defaultdict(lambda: defaultdict(dict))
     for path in sorted(folder.rglob("settings.json")):
         place = path.parent.relative_to(folder)
@@ -94,6 +96,8 @@ def read_runs(folder: Path) -> dict[str, dict[str, dict[str, dict[str, np.ndarra
             env, experiment, name = settings
             seeds = runs[env][experiment]
             seeds[f"{name}, {place}" if name in seeds else name] = columns
+    if not runs:
+        raise ValueError(f"{folder} holds no evaluated run.")
     return runs
 
 
@@ -279,25 +283,24 @@ def rows_of_all(runs: dict[str, dict]) -> list[str]:
     return [f"**IQM of {len(scores)}** | {end:,.0f} | – | – | – | {earned} | – | {seen} | –"]
 
 
+def show(folder: Path) -> None:
+    """Draws, writes and prints. A ValueError, in one sentence, if there is nothing to draw."""
+    runs, reference = read_runs(folder), read_reference()
+    draw(folder / "curves.png", runs, reference)
+    text = table(runs, reference)
+    (folder / "table.md").write_text(text, encoding="utf-8")
+    print(text, end="")
+
+
 def main(arguments: list[str]) -> int:
-    """Runs a command line. Returns the exit code: 0 done, 2 bad input."""
+    """Runs a command line. Returns its `exit_code`."""
     says = "Draws all runs below a folder: its curves.png and table.md."
     parser = argparse.ArgumentParser(prog="python results/plot.py", description=says)
     add, says = parser.add_argument, "where runs are, however deep (%(default)s)"
     add("folder", type=Path, nargs="?", default=WHOLE, help=says)
     folder = parser.parse_args(arguments).folder
     mpl.use("Agg")
-    try:
-        runs, reference = read_runs(folder), read_reference()
-        if not runs:
-            raise ValueError(f"{folder} holds no evaluated run: there is nothing to draw.")
-        draw(folder / "curves.png", runs, reference)
-        (folder / "table.md").write_text(table(runs, reference), encoding="utf-8")
-    except (ValueError, OSError) as error:
-        print(error, file=sys.stderr)
-        return 2
-    print(table(runs, reference), end="")
-    return 0
+    return exit_code(lambda: show(folder))
 
 
 if __name__ == "__main__":
