@@ -34,6 +34,7 @@ MOMENTS = 4  # of an episode, from which its actor's dreams are taken at their w
 # Names of the figures that the verdict looks at.
 DEVIATION = "deviation of the greedy action over states (near 0: frozen)"
 REWARDS = "rewards, R² (1: exact, 0: no better than their mean)"
+PARTS = ("being alive", "progress", "electricity", "joints at their limits", "colliding feet")
 ALIVE = "share of the rewards' variance that is the part for being alive"
 BLIND = "correlation of that part with the error of predicted rewards (0: it is known)"
 DECISIONS = "decisions"
@@ -73,36 +74,36 @@ def windows(x: Tensor, length: int) -> Tensor:
     return x.unfold(0, length, 1).movedim(-1, 0)
 
 
-def watch_alive(env) -> list[float]:
-    """The part for being alive of each reward that a PyBullet robot gives from now on, a physics
-    step each; it stays empty where the environment does not tell it apart."""
+def watch_parts(env) -> list[list[float]]:
+    """The PARTS of each reward that a PyBullet robot gives from now on, a physics step each; it
+    stays empty where the environment does not tell them apart."""
     robot, parts = env.unwrapped, []
-    if isinstance(getattr(robot, "_alive", None), float):  # since the step that make_env takes
+    if len(getattr(robot, "rewards", ())) == len(PARTS):  # since the step that make_env takes
         plain = robot.step
 
         def step(action):
             result = plain(action)
-            parts.append(robot._alive)
+            parts.append(robot.rewards)
             return result
 
         robot.step = step
     return parts
 
 
-def play_all(agent: Agent, env, name: str, alive: list[float], count: int):
-    """Episodes of an actor, and what `measure` says of them together; also alive: (M,) that part
-    of each decision's reward, if `watch_alive` tells it, and own: what `take_at_its_word` says."""
+def play_all(agent: Agent, env, name: str, parts: list[list[float]], count: int):
+    """Episodes of an actor, and what `measure` says of them together; also parts: (M, 5) those of
+    each decision's reward, if `watch_parts` tells them, and own: what `take_at_its_word` says."""
     s, episodes, found = agent.s, [], defaultdict(list)
     for k in range(count):
-        alive.clear()
+        parts.clear()
         seed = evaluation_seed(k)
         episode = play(agent, env, agent.players[name], seed, s.eval_max_steps)
         episodes.append(episode)
         for key, value in measure(agent, name, episode).items():
             found[key].append(value)
-        if alive:  # the last decision may have fewer physics steps than the others
-            first_steps = np.arange(0, len(alive), s.action_repeat)
-            found["alive"].append(np.add.reduceat(alive, first_steps))
+        if parts:  # the last decision may have fewer physics steps than the others
+            first_steps = np.arange(0, len(parts), s.action_repeat)
+            found["parts"].append(np.add.reduceat(parts, first_steps))
         found["own"].append(take_at_its_word(agent, env, name, episode, seed))
     return episodes, {key: np.concatenate(values) for key, values in found.items()}
 
@@ -231,10 +232,14 @@ def figures(found: dict[str, np.ndarray], episodes: list[Episode]) -> dict[str, 
         ENDS: ended[1].sum(),
         EXPECTED: ended[0].sum(),
     }
-    if "alive" in found and np.ptp(found["alive"]) and np.ptp(reward[1]):
-        # covariances with the whole of the parts of a sum are shares of its variance
-        named[ALIVE] = np.cov(found["alive"], reward[1])[0, 1] / np.var(reward[1], ddof=1)
-        named[BLIND] = np.corrcoef(found["alive"], reward[1] - reward[0])[0, 1]
+    if "parts" in found:
+        earned = found["parts"].sum(0) / len(episodes)
+        named |= {f"of the return, for {part}": of for part, of in zip(PARTS, earned, strict=True)}
+        alive = found["parts"][:, 0]
+        if np.ptp(alive) and np.ptp(reward[1]):
+            # covariances with the whole of the parts of a sum are shares of its variance
+            named[ALIVE] = np.cov(alive, reward[1])[0, 1] / np.var(reward[1], ddof=1)
+            named[BLIND] = np.corrcoef(alive, reward[1] - reward[0])[0, 1]
     if "sigma" in found:
         named[SIGMA] = found["sigma"].mean()
     if "outlived" in found:
@@ -373,9 +378,9 @@ def diagnose(command: argparse.Namespace) -> Path:
     folder = command.folder
     s, env, agent, networks = load(folder, command.checkpoint, command.device)
     played, found, named = {}, {}, {}
-    alive = watch_alive(env)
+    parts = watch_parts(env)
     for name in agent.actors:
-        played[name], found[name] = play_all(agent, env, name, alive, command.episodes)
+        played[name], found[name] = play_all(agent, env, name, parts, command.episodes)
         named[name] = figures(found[name], played[name])
     print(f"{s.env}, arm {s.arm}, networks {networks}")
     print(f"{'':78}" + "".join(f"{name:>15}" for name in named))

@@ -249,20 +249,19 @@ def test_short_episodes_are_diagnosed_and_drawn(length, terminated, tmp_path):
 
 
 @pytest.mark.parametrize("repeat", [1, 3])
-def test_the_part_for_being_alive_is_that_of_each_decision(repeat):
+def test_the_parts_of_a_reward_are_those_of_each_physics_step(repeat):
     env = make_env("HopperBulletEnv-v0", repeat)
-    alive = diagnose.watch_alive(env)
+    parts = diagnose.watch_parts(env)
     env.reset(seed=0)
     done, decisions, steps = False, [], 0
     while not done:  # it falls; at −1 a step once it lies
         _, reward, done, _, info = env.step(np.ones(3, np.float32))
         decisions.append(reward)
         steps = info["episode"]["l"] if done else steps
-    assert len(alive) == steps and alive[0] == 1 and alive[-1] == -1
-    rest = sum(env.unwrapped.rewards[1:])  # of the last physics step, which is all that is kept
-    if repeat == 1:
-        assert decisions[-1] == pytest.approx(alive[-1] + rest)
-    assert diagnose.watch_alive(gym.Env()) == []
+    assert len(parts) == steps and parts[0][0] == 1 and parts[-1][0] == -1
+    sums = np.add.reduceat(np.sum(parts, 1), np.arange(0, steps, repeat))
+    np.testing.assert_allclose(sums, decisions, rtol=1e-6)
+    assert diagnose.watch_parts(gym.Env()) == []
 
 
 def test_what_the_part_for_being_alive_explains_is_told_apart():
@@ -273,12 +272,14 @@ def test_what_the_part_for_being_alive_explains_is_told_apart():
     found = {
         "reward": np.stack([rest, alive + rest], -1), "terminated": np.zeros((4, 2)),
         "return": np.zeros((0, 2)), "saturated": np.zeros((4, 3)), "greedy": np.zeros((4, 3)),
-        "seen_image": np.zeros(4), "alive": alive,
+        "seen_image": np.zeros(4), "parts": np.outer(alive, [1, 0, 0, 0, 0]),
     }  # fmt: skip
     named = diagnose.figures(found, [episode])
     assert named[diagnose.ALIVE] == pytest.approx(0.5)
     assert named[diagnose.BLIND] == pytest.approx(1)
-    assert diagnose.ALIVE not in diagnose.figures(found | {"alive": np.ones(4)}, [episode])
+    assert named["of the return, for being alive"] == 0
+    lives = diagnose.figures(found | {"parts": np.ones((4, 5))}, [episode, episode])
+    assert diagnose.ALIVE not in lives and lives["of the return, for progress"] == 2  # an episode
 
 
 def test_what_is_seen_and_what_is_dreamt_are_held_apart():
