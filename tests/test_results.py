@@ -278,7 +278,8 @@ def test_what_the_part_for_being_alive_explains_is_told_apart():
     assert named[diagnose.ALIVE] == pytest.approx(0.5)
     assert named[diagnose.BLIND] == pytest.approx(1)
     assert named["of the return, for being alive"] == 0
-    lives = diagnose.figures(found | {"parts": np.ones((4, 5))}, [episode, episode])
+    parts = np.tile(np.arange(5.0), (4, 1))
+    lives = diagnose.figures(found | {"parts": parts}, [episode, episode])
     assert diagnose.ALIVE not in lives and lives["of the return, for progress"] == 2  # an episode
 
 
@@ -566,7 +567,7 @@ def test_two_runs_of_one_seed_are_two_lines_and_both_count(tmp_path, capsys):
     assert list(runs) == ["0", "0, b/c/run", "0, b/run"]
     assert plot.main([str(tmp_path)]) == 0
     out = capsys.readouterr().out
-    assert "| 0, b/run |" in out and "IQM" not in out  # of one seed
+    assert "| 0, b/run |" in out and "± 1.0" in out and "IQM" not in out  # of one seed
     write_run(tmp_path / "d", "7 8", seed=1)
     assert plot.main([str(tmp_path)]) == 0
     assert "| **IQM of 2** | 10,000 | – | – | – | 4.8 [1.8, 7.8] |" in capsys.readouterr().out
