@@ -7,8 +7,9 @@ fitted on its own imagined sequences, since V and Q are of the *current policy*.
 comes from world_model.py, time first: H steps, N sequences, D state, A action.
 """
 
+import contextlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -183,14 +184,21 @@ class Episode(NamedTuple):
     length: int  # environment steps
 
 
+@contextlib.contextmanager
+def drawn_by(seed: int, device: torch.device) -> Iterator[None]:
+    """Within it torch draws what the seed says; after it, as if nothing had been drawn."""
+    with torch.random.fork_rng([device] if device.type == "cuda" else []):
+        torch.manual_seed(seed)
+        yield
+
+
 def play(agent, env, policy: Callable, seed: int, most: int) -> Episode:
     """One episode of a policy, ended after `most` environment steps if it does not end before.
     Training's random numbers stay as they were."""
     image, _ = env.reset(seed=seed)
     images, actions, states = [image], [np.zeros(env.action_space.shape, np.float32)], [None]
     rewards, over, length = [], False, 0
-    with torch.random.fork_rng([agent.device] if agent.device.type == "cuda" else []):
-        torch.manual_seed(seed)
+    with drawn_by(seed, agent.device):
         while not over and length < most:
             action, state = act(agent, policy, images[-1], actions[-1], states[-1])
             image, reward, terminated, truncated, _ = env.step(action)

@@ -20,7 +20,7 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import train
-from actors import Episode, play
+from actors import Episode, drawn_by, play
 from env import EnvironmentFault
 
 ACTORS = ("stochastic", "deterministic")
@@ -67,8 +67,7 @@ def open_loop(agent: train.Agent, episode: Episode, frames: int, context: int = 
     frames = min(frames, len(episode.states))
     context = min(context, frames)
     actions = torch.from_numpy(episode.actions[context - 1 : frames - 1]).to(agent.device)
-    with torch.random.fork_rng([agent.device] if agent.device.type == "cuda" else []):
-        torch.manual_seed(0)
+    with drawn_by(0, agent.device):
         start = episode.states[context - 1 : context]
         dreamt = agent.model.along(start, actions.unsqueeze(1))[1:, 0]
         states = torch.cat([episode.states[:context], dreamt])

@@ -245,10 +245,9 @@ def table(runs, reference) -> str:
                 earned = f"{row['return']} ± {row['interval95']} | – | – | {row['length']} | – | –"
                 lines.append(f"{env} | {policy} actions | – | – | – | {earned}")
         for name, of in arms.items():
-            alone = len({seed.partition(",")[0] for seed in of}) == 1
-            goal = GOALS.get(env)
-            rows = [row_of(seed, run, alone, goal) for seed, run in sorted(of.items())]
-            lines += [f"{env} | {name} | {row}" for row in rows + rows_of_all(of)]
+            together, goal = rows_of_all(of), GOALS.get(env)
+            rows = [row_of(seed, run, not together, goal) for seed, run in sorted(of.items())]
+            lines += [f"{env} | {name} | {row}" for row in rows + together]
     return "".join(f"| {line} |\n" for line in lines)
 
 

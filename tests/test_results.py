@@ -264,6 +264,16 @@ def test_the_parts_of_a_reward_are_those_of_each_physics_step(repeat):
     assert diagnose.watch_parts(gym.Env()) == []
 
 
+@pytest.mark.parametrize("repeat", [1, 3])
+def test_the_parts_that_are_kept_are_of_the_episodes_decisions_alone(repeat):
+    """Dreams that are taken at their word, in between, give rewards too."""
+    s = dataclasses.replace(default_settings(), action_repeat=repeat, **TINY)
+    env = train.make_env_of(s)
+    parts, agent = diagnose.watch_parts(env), train.make_agent(s, env, precision="float32")
+    _, found = diagnose.play_all(agent, env, "deterministic", parts, count=2)
+    np.testing.assert_allclose(found["parts"].sum(1), found["reward"][:, 1], rtol=1e-5)
+
+
 def test_what_the_part_for_being_alive_explains_is_told_apart():
     """Of rewards 1 or −1 and as much beside it, half of the variance is of being alive; a model
     that predicts the rest alone is wrong by just that part."""
