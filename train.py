@@ -81,7 +81,7 @@ class Settings:
     eval_every: Count = 5_000  # environment steps between evaluations, once training began (ours)
     eval_episodes: Size = 10  # episodes per evaluation (§5: 10)
     eval_max_steps: Count = 10_000  # environment steps after which one of them is ended (ours)
-    checkpoint_minutes: Amount = 5.0  # between two; 500 decisions, evaluations make one too (ours)
+    checkpoint_minutes: Amount = 5.0  # between checkpoints; evaluations make one too (ours)
     replay_capacity: Count = 500_000  # rows (decisions) of experience kept (ours)
     action_repeat: Size = 2  # environment steps per decision (Dreamer)
     camera_distance: Amount = 1.7  # metres to a PyBullet robot; its own, 3, suits pendulums (ours)
@@ -917,7 +917,7 @@ def check(text: str, where: str = "") -> Settings:
     rows = s.prefill // s.action_repeat // n
     live = s.starts * s.batch_size * ((s.length - s.burn_in) // 2) / n  # that are no ends, at least
     enough = s.density != "knn" or not s.entropy or live >= 4
-    ahead = min(s.ends_ahead, s.length - 1) if s.termination else 0
+    ahead = s.ends_ahead if s.termination and s.burn_in else 0
     for possible, sentence in (
         (s.batch_size % n == 0, f"--batch-size {s.batch_size} is no multiple of {n} processes"),
         (s.burn_in <= s.length - 2, f"--burn-in leaves fewer than two rows of --length {s.length}"),
@@ -994,8 +994,9 @@ def resumed_run(command: Command) -> Run:
         whose = f" of {processes()} processes" if rank() else ""
         raise ValueError(f"{folder} holds no whole checkpoint{whose}: it cannot go on.")
     if (folder / f"rank-{processes()}").exists():
-        raise ValueError(f"{folder} was made by more processes than {processes()}: go on with as "
-                         "many (torchrun --nproc-per-node).")  # fmt: skip
+        began = 1 + len(list(folder.glob("rank-*")))
+        raise ValueError(f"{folder} was made by {began} processes: go on with as many "
+                         f"(torchrun --nproc-per-node {began}).")  # fmt: skip
     run.open()
     run.load()
     run.sign()

@@ -354,7 +354,8 @@ VERDICTS = (
      "more is promised than earned: the critic lags, or believes too much of its dreams."),
     # Chance alone takes some of it in 15 steps.
     (lambda of: of.get(AFTER, 1) < of[REWARDS] - 0.6,
-     "rewards are known where the image is seen and not in dreams: the dynamics are weak."),
+     "rewards are known where the image is seen and not in dreams: the dynamics are weak, or "
+     "nothing moves, and rewards hardly vary."),
 )  # fmt: skip
 
 

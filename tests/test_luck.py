@@ -435,7 +435,7 @@ def test_what_makes_a_run_what_it_is_cannot_be_changed(stub_run, capsys):
 def test_a_run_of_more_processes_is_not_gone_on_with_by_fewer(stub_run, capsys):
     before, other = contents(stub_run), stub_run / "rank-1"
     other.mkdir()
-    refused(["--resume", stub_run, "--steps", "180"], capsys, "more processes")
+    refused(["--resume", stub_run, "--steps", "180"], capsys, "--nproc-per-node 2")
     other.rmdir()
     assert contents(stub_run) == before
 

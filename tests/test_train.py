@@ -534,7 +534,8 @@ BAD = {
     "--density knn --batch-size 1 --length 9": "--batch-size",  # four of its rows may be no ends
     "--density gauss": "knn",
     "--length 7": "--ends-ahead 5",  # after a burn-in of two, no dream of five steps
-    "--ends-ahead 23": "--length",
+    "--ends-ahead 23": "--length above 25",
+    "--ends-ahead 30": "--length above 32",
     "--updates 1000000000": "--updates",
     "--eval-episodes 1000000000000": "--eval-episodes",
     "--floor-brightness 2": "--floor-brightness",
