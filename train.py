@@ -917,7 +917,8 @@ def check(text: str, where: str = "") -> Settings:
     rows = s.prefill // s.action_repeat // n
     live = s.starts * s.batch_size * ((s.length - s.burn_in) // 2) / n  # that are no ends, at least
     enough = s.density != "knn" or not s.entropy or live >= 4
-    ahead = s.ends_ahead if s.termination and s.burn_in else 0
+    # A window has more rows than these; without a burn-in, dreams too long for it are cut short.
+    needed = s.burn_in + (s.ends_ahead if s.termination and s.burn_in else 0)
     for possible, sentence in (
         (s.batch_size % n == 0, f"--batch-size {s.batch_size} is no multiple of {n} processes"),
         (s.burn_in <= s.length - 2, f"--burn-in leaves fewer than two rows of --length {s.length}"),
@@ -926,8 +927,8 @@ def check(text: str, where: str = "") -> Settings:
         (s.steps >= least, f"--steps {s.steps} leaves no update after --prefill: give {least}"),
         (s.eval_every >= s.train_every, f"--eval-every is less than --train-every {s.train_every}"),
         (enough, "--density knn needs four states to dream from: raise --batch-size or --length"),
-        (not ahead or s.burn_in + ahead < s.length,
-         f"--burn-in and --ends-ahead {ahead} need a --length above {s.burn_in + ahead}"),
+        (needed < s.length,
+         f"--burn-in and --ends-ahead {s.ends_ahead} need a --length above {needed}"),
     ):  # fmt: skip
         if not possible:
             raise ValueError(f"{where}{sentence}.")
