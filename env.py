@@ -248,7 +248,8 @@ class Foreign(gym.Wrapper, gym.utils.RecordConstructorArgs):
         state = np.full(self.state_size, np.nan)
         if self.state_size:
             with contextlib.suppress(Exception):  # what only measures never stops a run
-                state[:] = gym.spaces.flatten(self.env.observation_space, result[0])
+                flat = gym.spaces.flatten(self.env.observation_space, result[0])
+                state[:] = flat.reshape(self.state_size)  # one of another size raises
         # RecordEpisodeStatistics, next to come, asserts that there is no other "episode".
         info = {k: v for k, v in result[-1].items() if k not in ("episode", "_episode")}
         return *result[:-1], info | {"state": state}

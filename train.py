@@ -475,7 +475,8 @@ def join_processes() -> None:
     NCCL on CUDA, a device each. A ValueError if there are fewer devices."""
     if not dist.is_torchelastic_launched() or dist.is_initialized():
         return
-    devices, here = torch.cuda.device_count(), int(os.environ["LOCAL_WORLD_SIZE"])
+    here = int(os.environ["LOCAL_WORLD_SIZE"])
+    devices = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if 0 < devices < here:
         raise ValueError(f"--nproc-per-node {here} is more than the {devices} CUDA devices; "
                          "with CUDA_VISIBLE_DEVICES= before it, CPUs compute.")  # fmt: skip
@@ -563,8 +564,9 @@ class Run:
         self.seconds, self.clock = 0.0, time.monotonic()  # up to the last checkpoint; its time
         self.saved_rows = 0  # added to the replay, at the last checkpoint
         precision = "bfloat16" if self.agent.bfloat16 else "float32"
-        on_cuda = self.agent.device.type == "cuda"
-        chip = torch.cuda.get_device_name() if on_cuda else torch.backends.cpu.get_cpu_capability()
+        self.on_cuda = self.agent.device.type == "cuda"
+        chip = torch.backends.cpu.get_cpu_capability()
+        chip = torch.cuda.get_device_name() if self.on_cuda else chip
         self.machine = f"{self.agent.device} ({chip}), {precision}, {torch.get_num_threads()} "
         self.machine += f"threads, torch {torch.__version__}"
         self.machine += f", {processes()} processes" if processes() > 1 else ""
@@ -705,7 +707,7 @@ class Run:
             "kept": {name: getattr(self, name) for name in self.KEPT},
             "checksums": torch.from_numpy(self.replay.flush()),
             "torch_random": torch.get_rng_state(),
-            "cuda_random": torch.cuda.get_rng_state_all(),
+            "cuda_random": [torch.cuda.get_rng_state()] if self.on_cuda else [],
             "numpy_random": json.dumps(self.rng.bit_generator.state),
         }
         write_whole(newest, content, keep=previous)
@@ -737,9 +739,8 @@ class Run:
         if not self.over:
             self.retrace()
         torch.set_rng_state(saved["torch_random"])
-        if self.agent.device.type == "cuda":
-            states = saved["cuda_random"][: torch.cuda.device_count()]  # there may be fewer now
-            torch.cuda.set_rng_state_all(states)
+        if self.on_cuda and saved["cuda_random"]:  # none, if it was saved on a CPU
+            torch.cuda.set_rng_state(saved["cuda_random"][0])
         for name in CHANGEABLE:
             if now[name] != made[name]:
                 since = f"{name}: {now[name]} instead of {made[name]} from step {self.step:,} on"
@@ -1085,8 +1086,9 @@ def explained(error: Exception, run: Run) -> str:
     if isinstance(error, OSError):
         return f"{error}: stopped; what was saved before is whole."
     if isinstance(error, MemoryError) or "alloc" in str(error).lower():
+        why = f": {reason.rstrip('.')}" if reason else ""
         size = f"--batch-size {run.s.batch_size} and --length {run.s.length}"
-        return f"No memory for an update of {size}: {reason}"
+        return f"No memory for an update of {size}{why}."
     if dist.is_initialized() and re.search("gloo|NCCL", str(error)):
         return f"{OTHERS_ENDED}: stopped; what was saved before is whole."
     raise error

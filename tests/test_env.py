@@ -501,6 +501,7 @@ OWN = {
     ),
     "not what it says": (Box(-9, 9, (3,)), [[1, 2], [3]], [np.nan] * 3),
     "too long": (Box(-9, 9, (3,)), np.zeros(4), [np.nan] * 3),
+    "one number": (Box(-9, 9, (3,)), 3, [np.nan] * 3),
     "not finite": (Box(-9, 9, (2,)), np.array([np.inf, 1]), [np.inf, 1]),
     "sequence": (spaces.Sequence(Box(0, 1, (2,))), (), []),
     "graph": (spaces.Graph(Box(0, 1, (2,)), None), None, []),

@@ -688,7 +688,24 @@ def test_memory_that_runs_out_in_an_update_names_what_asked_for_it(
 
     monkeypatch.setattr("env.Replay.sample", nothing)
     assert train.main(["--resume", str(folder)]) == 1
-    assert "Traceback" not in capfd.readouterr().err
+    said = capfd.readouterr().err
+    assert "Traceback" not in said and "--length 8. Go on with: " in said
+
+
+def test_a_driver_that_is_seen_and_cannot_be_used_does_not_stop_a_run_on_the_cpu(
+    register, tmp_path, monkeypatch
+):
+    def too_old():
+        raise RuntimeError("The NVIDIA driver on your system is too old")
+
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
+    monkeypatch.setattr("torch.cuda.random.device_count", lambda: 1)
+    for module in ("torch.cuda", "torch.cuda.random"):
+        monkeypatch.setattr(f"{module}._lazy_init", too_old)
+    folder = str(tmp_path / "run")
+    assert train.main(["--env", register(Base), "--run-dir", folder, *FAST]) == 0
+    assert train.main(["--resume", folder, "--steps", "120"]) == 0
 
 
 # ---- the command line ----------------------------------------------------------------------------
