@@ -172,6 +172,49 @@ def test_all_states_count_by_their_survival():
     assert continues.grad is None
 
 
+class Table(nn.Module):
+    """Q of each of three states and two actions, both one-hot."""
+
+    def __init__(self):
+        super().__init__()
+        self.q = nn.Parameter(torch.zeros(3, 2).double())
+
+    def forward(self, state, action):
+        return torch.einsum("...s,...a,sa->...", state, action, self.q)
+
+
+@pytest.mark.parametrize("lam", [0.0, 0.95])
+def test_a_critic_learns_eq2_of_a_chain_with_ends(lam):
+    """Q(s, a) = r(s') + γ c(s') Q(s', π(s')), solved. Dreams of three steps take each first action
+    from each state, and then π's."""
+    follows = torch.tensor([[1, 2], [2, 0], [0, 1]])  # s' of s and a
+    reward, continues = torch.tensor([1.0, -2.0, 3.0]).double(), torch.tensor([1.0, 0.6, 0.0])
+    chosen = torch.tensor([0, 1, 1])  # π
+    states, actions = [torch.arange(3).repeat_interleave(2)], [torch.tensor([0, 1]).repeat(3)]
+    for _ in range(3):
+        states.append(follows[states[-1], actions[-1]])
+        actions.append(chosen[states[-1]])
+    states, actions = torch.stack(states), torch.stack(actions)
+    imagined = dream(
+        nn.functional.one_hot(states, 3).double(), nn.functional.one_hot(actions, 2).double(),
+        reward[states[1:]], continues.double()[states[1:]],
+    )  # fmt: skip
+    table = Table()
+    optimiser = torch.optim.SGD(table.parameters(), 2.0)
+    for _ in range(300):
+        returns = imagined_returns(imagined, table, GAMMA, lam)
+        optimiser.zero_grad()
+        critic_loss(table, imagined, returns.detach(), smooth_l1=False).backward()
+        optimiser.step()
+    under_policy = follows[torch.arange(3), chosen]
+    matrix = torch.eye(3).double() - GAMMA * continues.double()[under_policy].unsqueeze(
+        1
+    ) * nn.functional.one_hot(under_policy, 3)
+    value = torch.linalg.solve(matrix, reward[under_policy])
+    expected = (reward + GAMMA * continues * value)[follows]
+    torch.testing.assert_close(table.q.detach(), expected, rtol=1e-4, atol=1e-4)
+
+
 class Constant(nn.Module):
     """A critic that says the same of everything."""
 

@@ -405,7 +405,10 @@ def test_losses_are_the_weighted_sums_of_their_named_terms(arm):
         losses[name] = loss.item()
         step()
 
-    weights = {"image": 0.5, "reward": 2.0, "kl": 1.5, "kl_standard": 0.3, "jeffreys": 0.7}
+    weights = {
+        "image": 0.5, "reward": 2.0, "termination": 4.0, "kl": 1.5, "kl_standard": 0.3,
+        "jeffreys": 0.7,
+    }  # fmt: skip
     s = tiny(arm, **{f"{name}_weight": weight for name, weight in weights.items()})
     metrics = watched_update(s, watch)
     terms = {k.removeprefix("model/"): v for k, v in metrics.items() if k.startswith("model/")}
@@ -415,7 +418,7 @@ def test_losses_are_the_weighted_sums_of_their_named_terms(arm):
         {"termination", "kl_standard", "jeffreys"} if revised else {"kl"}
     )
     assert terms.keys() == names
-    total = sum(weights.get(name, 10) * term for name, term in terms.items())  # §2: ends weigh 10
+    total = sum(weights[name] * term for name, term in terms.items())
     assert losses["model"] == pytest.approx(total, rel=1e-6)
     if revised:  # first state only
         expected = -metrics["stochastic_actor/return"]
@@ -439,6 +442,34 @@ def test_the_online_mdn_learns_and_the_target_mdn_rewards():
     plain, online, target = metrics(None), metrics("mdn"), metrics("target_mdn")
     assert online["mdn/entropy"] == plain["mdn/entropy"] != target["mdn/entropy"]
     assert target["mdn/nll"] == plain["mdn/nll"] != online["mdn/nll"]
+
+
+@pytest.mark.parametrize("name", ["stochastic", "deterministic"])
+def test_each_actor_climbs_its_own_critic(name):
+    other = {"stochastic": "deterministic", "deterministic": "stochastic"}[name]
+    _, plain = updated(tiny("maxent"))
+    agent = make_agent(tiny("maxent"))
+    for p in agent.critics[name].parameters():
+        p.data += 0.1
+    torch.manual_seed(1)
+    metrics = update(agent, make_batch(agent.s), 0.1)
+    for what in ("actor/return", "critic/loss"):
+        assert metrics[f"{name}_{what}"] != plain[f"{name}_{what}"]
+        assert metrics[f"{other}_{what}"] == plain[f"{other}_{what}"]
+
+
+def test_nothing_counts_after_an_end_in_what_is_learnt_of_future_states():
+    """With c = 0 everywhere a dream's first step is all of q: longer ones say the same of it."""
+    found = []
+    for horizon in (1, 3):
+        agent = make_agent(tiny("maxent", horizon=horizon, deterministic_actor=False))
+        constant_end = agent.model.termination[-1]
+        torch.nn.init.zeros_(constant_end.weight)
+        torch.nn.init.constant_(constant_end.bias, 200.0)
+        torch.manual_seed(1)
+        metrics = update(agent, make_batch(agent.s), 0.1)
+        found.append([metrics["mdn/entropy"], metrics["mdn/nll"]])
+    assert found[0] == pytest.approx(found[1], rel=1e-5)
 
 
 def test_beta_moves_the_stochastic_actor_and_not_the_deterministic_one():
@@ -570,17 +601,20 @@ def test_a_model_that_knows_no_numbers_any_more_stops_the_update_and_nothing_mov
 # --- what learning was found to need ---
 
 
-def test_half_of_the_live_states_are_drawn_anew_for_each_dream():
-    s = tiny("revised", starts=0.5)
+def test_half_of_the_live_states_are_drawn_anew_for_each_update():
+    s = tiny("maxent", starts=0.5)
     agent, batch, starts = make_agent(s), make_batch(s), []
     imagine = agent.model.imagine
     agent.model.imagine = lambda start, *rest: starts.append(start) or imagine(start, *rest)
-    for _ in range(2):
-        update(agent, batch, 0.1)
-    live = int((~batch["terminated"]).sum())
-    assert [len(start) for start in starts] == 2 * [round(live / 2)]
-    assert len(starts[0].unique(dim=0)) == len(starts[0])  # none twice
-    assert not torch.equal(*starts)
+    update(agent, batch, 0.1)
+    live = (~batch["terminated"]).flatten().nonzero().squeeze(1)
+    assert [len(start) for start in starts] == 2 * [round(len(live) / 2)]
+    states, drawn = torch.arange(18.0).view(3, 6, 1), []
+    for _ in range(200):
+        drawn.append(train.dream_starts(states, live, 0.5).flatten().long())
+        assert len(drawn[-1].unique()) == len(drawn[-1])  # none twice
+    times = torch.cat(drawn).bincount(minlength=18)[live]
+    assert times.sum() == 200 * round(len(live) / 2) and stats.chisquare(times).pvalue > 0.001
 
 
 @pytest.mark.parametrize("detach_policy", [True, False])
@@ -694,9 +728,13 @@ def test_neighbours_take_the_place_of_the_mdn(bfloat16):
     assert one[1]["mdn/entropy"] == other[1]["mdn/entropy"] and "mdn/nll" not in one[1]
     asked = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("train.particle_entropy", lambda z, *_: asked.append(z.shape) or z.sum(-1))
+        patch.setattr("train.particle_entropy", lambda z, *_: asked.append(z) or z.sum(-1))
+        imagine, dreams = train.WorldModel.imagine, []
+        noting = lambda *a: dreams.append(imagine(*a)) or dreams[-1]  # noqa: E731
+        patch.setattr("train.WorldModel.imagine", noting)
         updated(s, 0.1, bfloat16)
-    assert [shape[0::2] for shape in asked] == [(s.horizon + 1, s.stoch)]
+    (z,), dream = asked, dreams[0]
+    assert torch.equal(z, dream.state[..., s.deter :]) and z.shape[::2] == (s.horizon + 1, s.stoch)
 
 
 def test_rewards_are_squared_where_asked_and_the_critic_keeps_smooth_l1():

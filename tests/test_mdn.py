@@ -219,12 +219,16 @@ def test_eq10_fixed_point_is_the_discounted_occupancy(n, size):
 def test_eq10_fixed_point_is_not_what_eq9_prints():
     """At n = 1 (9) prints q = (1 − γ) p + γ q, which is q = p: nothing of later states."""
     transition, _ = random_chain(4)
+    printed = torch.full((4, 4), 0.25).double()
+    for _ in range(400):
+        printed = (1 - GAMMA) * transition + GAMMA * printed
+    torch.testing.assert_close(printed, transition)
     got = fixed_point(transition, torch.ones(4).double(), 1)
     expected = sum(
         (1 - GAMMA) * GAMMA ** (k - 1) * transition.matrix_power(k) for k in range(1, 400)
     )
     torch.testing.assert_close(got, expected)
-    assert (got - transition).abs().max() > 0.1
+    assert (got - printed).abs().max() > 0.1
 
 
 def test_eq10_fixed_point_is_where_simulated_episodes_are_found():
@@ -324,6 +328,15 @@ def test_entropy_sampled_from_the_target_alone_has_no_gradient():
         for estimate in (direct, via_states)
     ]
     assert gradients == [0, pytest.approx((1 - GAMMA) / SIGMA, rel=0.05)]
+
+
+@pytest.mark.parametrize("estimate", [mdn_loss, entropy])
+def test_of_an_episode_that_ends_at_once_its_last_state_alone_counts(estimate):
+    """c_{t+1} = 0: q(· | s_t) is all at s_{t+1}, whatever is dreamt after it."""
+    mdn, states = MixtureDensityNetwork(2), torch.randn(4, 5, 2)
+    continues = torch.tensor([0.0, 1.0, 1.0]).unsqueeze(1).expand(3, 5)
+    expected = -mdn(states[0]).log_prob(states[1:2])[0]
+    torch.testing.assert_close(estimate(mdn, states, continues, GAMMA), expected)
 
 
 # Where gradients go

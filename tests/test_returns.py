@@ -31,13 +31,13 @@ def test_lambda_return_is_eq5_as_printed_but_for_termination(lam):
         torch.testing.assert_close(got[k], discount[-1] * value[-1] + (discount[:-1] * step).sum(0))
 
 
-@LAMBDAS
+@pytest.mark.parametrize("lam", [0.3, 0.95])
 def test_lambda_return_is_a_weighted_mean_where_its_printed_definition_is_not(lam):
     """The weights of the definition above Eq. (5) sum to 1 + λ^T (1 − λ)."""
     zero, one = torch.zeros(3, 1), torch.ones(3, 1)
     assert lambda_return(zero, one, one, 1.0, lam)[0].item() == pytest.approx(1)
     printed = (1 - lam) * sum(lam**t for t in range(4)) + lam**3  # T = 3, all G_t = 1
-    assert printed == pytest.approx(1 + lam**3 * (1 - lam))
+    assert printed == pytest.approx(1 + lam**3 * (1 - lam)) and printed > 1.01
 
 
 @LAMBDAS
@@ -95,6 +95,17 @@ def test_coefficients_of_rewards_and_values():
     np.testing.assert_allclose(of_reward[:, 0], [1, 0.45, 0.45**2, 0.45**3])
     expected = [0.5 * 0.9, 0.25 * 0.9**2, 0.125 * 0.9**3, 0.125 * 0.9**4]
     np.testing.assert_allclose(of_value[:, 0], expected)
+
+
+def test_an_end_costs_what_would_have_come_after_it():
+    """∂R_0/∂c_1 = γ · 4.3, which is ½ V(s_1) + ½ R_1, and ∂R_0/∂c_2 = γ² λ c_1 V(s_2): it is by
+    these alone that an actor learns to avoid ends."""
+    continues = torch.tensor([[0.5], [1.0]], requires_grad=True)
+    reward, value = torch.tensor([[1.0], [2.0]]), torch.tensor([[3.0], [4.0]])
+    R = lambda_return(reward, continues, value, GAMMA, 0.5)[0].sum()
+    (slope,) = torch.autograd.grad(R, continues)
+    assert R.item() == pytest.approx(2.935)
+    assert slope.flatten().tolist() == pytest.approx([3.87, 0.81])
 
 
 @LAMBDAS

@@ -155,13 +155,18 @@ def test_coverage_is_of_the_rows_since_the_last_evaluation(tmp_path, monkeypatch
 def test_only_the_explorers_actions_are_disturbed(
     arm, collect, turn, turns, noise, tmp_path, monkeypatch, numpy_env
 ):
-    """What the evaluated actor collects is what it would earn, so the model learns of that."""
+    """What the evaluated actor collects is what it would earn, so the model learns of that. Whoever
+    acts remembers the episode, and nothing of the one before."""
     seen = []  # who acts, and whether the action before was a disturbed one
+    remembered = [None]
 
     def acting(agent, policy, image, action, state):
         who = {agent.players["stochastic"]: "E", agent.evaluated.greedy: "A"}[policy]
+        assert state is (remembered[-1] if action.any() else None)  # 0 before the first image
         seen.append((who, bool((action == 1).all())))
-        return actors.act(agent, policy, image, action, state)
+        action, state = actors.act(agent, policy, image, action, state)
+        remembered.append(state)
+        return action, state
 
     def exploring(action, *how):
         assert how[:2] == (noise, 0.5)

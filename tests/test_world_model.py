@@ -143,6 +143,52 @@ def test_original_kl_moves_prior_and_posterior():
     assert all(moves(terms["kl"], model.posterior_out.parameters()))
 
 
+# --- what the terms teach ---
+
+
+@pytest.mark.parametrize("name", ["image", "reward", "termination"])
+def test_what_is_seen_and_predicted_shapes_the_states(name):
+    model = make_model()
+    term = loss(model, make_batch())[0][name]
+    for part in (model.encoder, model.posterior_out, model.gru, model.dense_action):
+        assert all(moves(term, part.parameters()))
+
+
+def test_ends_in_dreams_shape_the_states_too():
+    gradients = []
+    for ahead in (0, 2):
+        model = make_model(ends_ahead=ahead)
+        term = loss(model, make_batch())[0]["termination"]
+        gradients += torch.autograd.grad(term, model.posterior_out.weight)
+    assert not torch.allclose(*gradients)
+
+
+@pytest.mark.parametrize("name, fixed_prior", [("jeffreys", True), ("kl", False)])
+def test_divergences_teach_what_the_prior_knows(name, fixed_prior):
+    """Through the prior alone, into what h is made of."""
+    model, batch = make_model(fixed_prior=fixed_prior), make_batch()
+    observed, seen = observe(model, batch), torch.ones(3, 6)
+    given = Normal(observed.posterior.mean.detach(), observed.posterior.stddev.detach())
+    term = model.divergences(given, observed.prior, seen)[name]
+    assert all(moves(term, [*model.gru.parameters(), *model.dense_action.parameters()]))
+
+
+@pytest.mark.parametrize("by", ["h", "z"])
+def test_states_learn_from_all_that_came_before_in_their_episode(by):
+    """Through time, by either half of the state alone."""
+    model, batch = make_model(), make_batch()
+    if by == "h":
+        nn.init.zeros_(model.dense_stoch.weight)
+    else:
+        nn.init.zeros_(model.gru.weight_hh)
+        model.gru.bias_ih.data[DETER : 2 * DETER] = -200  # of the gate that keeps h
+    batch["action"].requires_grad_()
+    last = observe(model, batch).state[:, -1, :DETER].sum()
+    (gradient,) = torch.autograd.grad(last, batch["action"])
+    reached = [[0, 1, 1, 1, 1, 1], [0, 0, 0, 0, 1, 1], [0, 1, 1, 1, 1, 1]]
+    assert gradient.ne(0).any(-1).int().tolist() == reached
+
+
 # --- decoder, encoder and the image loss ---
 
 
@@ -405,6 +451,9 @@ def test_rows_of_which_too_little_was_seen_teach_no_reward_and_no_end():
             changed[row] = wrong[row]
             same = loss(model, batch | {name: changed})[0][term] == before[term]
             assert same != counts
+    all_taught, _ = loss(make_model(), batch)
+    for name in ("image", "kl_standard", "jeffreys"):  # they teach of all that was seen
+        assert before[name] == all_taught[name]
 
 
 def test_ends_are_learnt_in_dreams_too():
