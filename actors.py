@@ -127,7 +127,7 @@ def critic_loss(critic: nn.Module, dream: Dream, returns: Tensor, smooth_l1: boo
     return (survival(dream.continues) * error).mean()
 
 
-def nudge(action: Tensor, std: float) -> Tensor:
+def add_noise(action: Tensor, std: float) -> Tensor:
     """An action plus reparametrised noise, clipped to [−1, 1]. An actor that learns with it earns
     despite small errors, and a deterministic actor's critic sees actions beside A(s), without which
     its slope ∂Q/∂a there is arbitrary."""

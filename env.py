@@ -1,6 +1,6 @@
 """Experience: environments seen through their pixels, the replay buffer of what was seen, and
 how much of the environment's own states that covers. `make_env` and `Replay` are what the algorithm
-needs; the rest keeps a stranger's environment from breaking a run.
+needs; most of the rest keeps a stranger's environment from breaking a run.
 
 The observation is the rendered 64×64 image and nothing else (§5). Rows are arrival-indexed: an
 observation stands beside the action that led to it, and the reward and termination received.
@@ -107,8 +107,8 @@ def make_env(env_id: str, action_repeat=2, camera_distance=None, floor_brightnes
 
 
 def find_spec(env_id: str) -> gym.envs.registration.EnvSpec:
-    """The environment of that name, after the import of the module before its colon, if any. The
-    EnvironmentFault that there is none names similar ones."""
+    """The environment of that name, after the import of the module before its colon, if any. If
+    there is none, an EnvironmentFault names similar ones."""
     module, colon, name = env_id.rpartition(":")
     if colon:
         with blame(env_id):

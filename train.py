@@ -48,7 +48,7 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 import actors
-from actors import act, actor_loss, critic_loss, explore, imagined_returns, nudge, play
+from actors import act, actor_loss, add_noise, critic_loss, explore, imagined_returns, play
 from env import EnvironmentFault, Replay, coverage, make_env
 from mdn import MixtureDensityNetwork, entropy, mdn_loss, particle_entropy, soft_update
 from world_model import Dream, WorldModel, share_of
@@ -56,7 +56,7 @@ from world_model import Dream, WorldModel, share_of
 Arm = Literal["dreamer", "dreamer-maxent", "revised", "maxent"]
 Preset = Literal["small", "paper"]
 Collect = Literal["explorer", "both"]
-Size = Annotated[int, Interval(ge=1, le=10_000)]  # of a layer, batch or sequence
+Size = Annotated[int, Interval(ge=1, le=10_000)]  # of a layer or batch; other small numbers
 Count = Annotated[int, Interval(ge=1, le=10**9)]  # of steps or rows
 Whole = Annotated[int, Interval(ge=0, lt=2**63)]
 Share = Annotated[float, Interval(ge=0, le=1)]
@@ -202,7 +202,7 @@ def update(
         loss = sum(weights[name] * term for name, term in terms.items())
     metrics = {f"model/{name}": term for name, term in terms.items()}
     metrics["reward_r2"] = reward_r2(agent, states, batch)
-    agent.step("model", loss, metrics)
+    agent.optimise("model", loss, metrics)
     starts = dream_starts(states, live, s.starts)
     for name in agent.actors:
         update_actor(agent, name, starts, beta, metrics, look)
@@ -252,41 +252,52 @@ def update_actor(
     s, actor, critic = agent.s, agent.actors[name], agent.critics[name]
     with_entropy = name == "stochastic" and s.entropy
     with agent.autocast():
-        dream = agent.model.imagine(starts, dreaming(agent, name), s.horizon)
+        dream = agent.model.imagine(starts, dream_policy(agent, name), s.horizon)
         returns = imagined_returns(dream, critic, s.gamma, s.lam)
         terms = {"return": actor_loss(returns, dream.continues, s.first_state_only)}
         if with_entropy:
             metrics["mdn/entropy"] = future_entropy(agent, dream)
             terms["entropy"] = -beta * metrics["mdn/entropy"]
-        if look and with_entropy:
-            measure_gradients(actor, terms, metrics, len(starts))
+            if look:
+                measure_gradients(actor, terms, metrics, len(starts))
         penalty = s.action_penalty * actor.raw(starts).square().sum(-1).mean()
         loss = sum(terms.values()) + penalty
-    metrics[f"{name}_actor/return"] = returns[0].mean()
-    metrics[f"{name}_actor/saturated"] = (dream.action.abs() > 0.99).float().mean()
-    metrics[f"{name}_actor/deviation"] = actor.greedy(starts).detach().std(0, correction=0).mean()
-    if name == "stochastic":
-        metrics["stochastic_actor/sigma"] = actor.distribution(starts).stddev.mean()
-    agent.step(f"{name}_actor", loss, metrics, len(starts))
+    metrics |= actor_metrics(actor, starts, dream, returns, name)
+    agent.optimise(f"{name}_actor", loss, metrics, len(starts))
     with agent.autocast():
         loss = critic_loss(critic, dream, returns, s.smooth_l1)
     metrics[f"{name}_critic/loss"] = loss
-    agent.step(f"{name}_critic", loss, metrics, len(starts))
+    agent.optimise(f"{name}_critic", loss, metrics, len(starts))
     if with_entropy and s.density == "mdn":
         with agent.autocast():
             loss = mdn_loss(agent.mdn, dream.state, dream.continues, s.gamma_q).mean()
         metrics["mdn/nll"] = loss
-        agent.step("mdn", loss, metrics, len(starts))
+        agent.optimise("mdn", loss, metrics, len(starts))
 
 
-def dreaming(agent: "Agent", name: str) -> Callable[[Tensor], Tensor]:
+@torch.no_grad()
+def actor_metrics(
+    actor: nn.Module, starts: Tensor, dream: Dream, returns: Tensor, name: str
+) -> dict[str, Tensor]:
+    """What the log shows of an actor: what it is promised, and whether its actions still vary."""
+    found = {
+        "return": returns[0].mean(),
+        "saturated": (dream.action.abs() > 0.99).float().mean(),
+        "deviation": actor.greedy(starts).std(0, correction=0).mean(),
+    }
+    if name == "stochastic":
+        found["sigma"] = actor.distribution(starts).stddev.mean()
+    return {f"{name}_actor/{what}": value for what, value in found.items()}
+
+
+def dream_policy(agent: "Agent", name: str) -> Callable[[Tensor], Tensor]:
     """What an actor does in its dreams, states (N, D) to actions (N, A): its action plus
     `dream_noise`; with `detach_policy` no gradient goes back into the states that it sees."""
     s, actor = agent.s, agent.actors[name]
 
     def policy(state: Tensor) -> Tensor:
         action = actor(state.detach() if s.detach_policy else state)
-        return nudge(action, s.dream_noise) if s.dream_noise else action
+        return add_noise(action, s.dream_noise) if s.dream_noise else action
 
     return policy
 
@@ -388,14 +399,6 @@ def evaluation_seed(k: int) -> int:
     return 2**31 - 1 - k  # some environments take none that is larger
 
 
-def interval95(returns: np.ndarray) -> float:
-    """Half the width of the mean's 95% t-interval (§5); nan for a single return."""
-    if len(returns) < 2:
-        return float("nan")
-    quantile = stdtrit(len(returns) - 1, 0.975)  # of Student's t
-    return float(quantile * np.std(returns, ddof=1) / math.sqrt(len(returns)))
-
-
 class Agent(nn.Module):
     """All networks of a run with A actions, and one Adam for each that learns."""
 
@@ -446,10 +449,11 @@ class Agent(nn.Module):
         so each forward pass between two optimiser steps has its own."""
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16)
 
-    def step(self, name: str, loss: Tensor, metrics: dict[str, Tensor], count: int = 1) -> None:
+    def optimise(self, name: str, loss: Tensor, metrics: dict[str, Tensor], count: int = 1) -> None:
         """One step of the named optimiser on `loss`, the mean over this process's `count` things.
         `metrics` get the gradient's norm, which is not finite if, in any process, it or the loss is
-        not. Once they hold such a norm, no later step of this update changes anything."""
+        not. Once they hold such a norm, neither this step nor any later one of the update changes
+        anything."""
         optimiser = self.optimisers[name]
         parameters = optimiser.param_groups[0]["params"]
         optimiser.zero_grad()
@@ -466,7 +470,7 @@ class Agent(nn.Module):
     def follow(self) -> None:
         """Move the averages that follow what learns: the players, and the target MDN (§4.1)."""
         soft_update(self.players, self.actors, self.s.play_rate)
-        if self.s.entropy and self.s.density == "mdn":
+        if "mdn" in self.optimisers:
             soft_update(self.target_mdn, self.mdn, self.s.target_rate)
 
 
@@ -515,8 +519,8 @@ def gathered(thing: Any) -> list:
 
 
 def average_over_processes(tensors: list[Tensor], count: int) -> None:
-    """Replace each by its mean over processes, weighted by their counts, in one message: of
-    gradients of means over so many things, that is the gradient of the mean over all."""
+    """Replace each tensor by its mean over processes, weighted by `count`, in one message. The
+    gradient of a mean over each process's `count` things so becomes that of the mean over all."""
     if processes() == 1:
         return
     flat = torch.cat([x.flatten() for x in tensors] + [tensors[0].new_ones(1)]) * count
@@ -526,6 +530,62 @@ def average_over_processes(tensors: list[Tensor], count: int) -> None:
         x.copy_(mean.view_as(x))
 
 
+def make_env_of(s: Settings):
+    """The environment as an agent of these settings sees it."""
+    return make_env(s.env, s.action_repeat, s.camera_distance, s.floor_brightness)
+
+
+def make_agent(s: Settings, env, device: str = "auto", precision: str = "auto") -> Agent:
+    """An untrained agent; a ValueError if the device is not there or no memory holds it."""
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ValueError("--device cuda: no CUDA device is here; leave it out to use the CPU.")
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = torch.device(device)
+    bfloat16 = precision == "bfloat16"
+    if precision == "auto":
+        bfloat16 = all(gathered(has_bfloat16(device)))  # processes share their gradients' digits
+    try:
+        return Agent(s, env.action_space.shape[0], device, bfloat16)
+    except RuntimeError as error:  # sizes that no memory holds
+        raise ValueError(f"The networks cannot be made: {str(error).splitlines()[0]}") from None
+
+
+@functools.cache
+def has_bfloat16(device: torch.device) -> bool:
+    """Whether bfloat16 products are in the hardware; emulated, they are slow. On some processors
+    that have them PyTorch convolves without them, so one convolution is timed in both."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    capabilities = torch.cpu.get_capabilities()
+    if not any(capabilities.get(name, False) for name in ("avx512_bf16", "amx_bf16", "bf16")):
+        return False
+    slower = convolution_seconds(torch.bfloat16) / convolution_seconds(torch.float32)
+    if slower > 3:  # about 1 where they are used, 6 where not
+        say(f"Convolutions in bfloat16 are {slower:.0f} times slower here: float32 is used.")
+    return slower <= 3
+
+
+def convolution_seconds(dtype: torch.dtype) -> float:
+    """Seconds of one of the encoder's convolutions on this CPU, the least of twenty tries."""
+    x, weight = torch.ones(50, 16, 31, 31, dtype=dtype), torch.ones(32, 16, 4, 4, dtype=dtype)
+    timer = timeit.Timer(lambda: nn.functional.conv2d(x, weight, stride=2))
+    return min(timer.repeat(repeat=20, number=2)) / 2
+
+
+def interval95(returns: np.ndarray) -> float:
+    """Half the width of the mean's 95% t-interval (§5); nan for a single return."""
+    if len(returns) < 2:
+        return float("nan")
+    quantile = stdtrit(len(returns) - 1, 0.975)  # of Student's t
+    return float(quantile * np.std(returns, ddof=1) / math.sqrt(len(returns)))
+
+
+CHECKPOINTS = ("checkpoint.pt", "checkpoint.previous.pt")
+CHANGEABLE = (
+    "steps", "eval_every", "eval_episodes", "eval_max_steps", "checkpoint_minutes", "model_lr",
+    "actor_lr", "critic_lr", "mdn_lr", "grad_clip",
+)  # fmt: skip
 TURN = 1000  # environment steps, the length of a robot's whole episode
 
 
@@ -533,8 +593,9 @@ class Run:
     """All that a run is: environments, agent, replay, random states, counters, and its folder.
 
     The folder holds settings.json; metrics.csv, a row an evaluation; TensorBoard's events; best.pt
-    and, at the end, weights.pt, the networks alone; replay.bin; and the last two checkpoints:
-    networks, optimisers, random states, what KEPT names, and the checksums of the replay's rows.
+    and, at the end, weights.pt, the networks alone; replay.bin; the last two checkpoints: networks,
+    optimisers, random states, what KEPT names, and the checksums of the replay's rows; and
+    run.lock and run.owner, by which no two processes write to it.
     Of several processes the others have a folder each in it, with their replay and checkpoints.
     """
 
@@ -543,7 +604,7 @@ class Run:
         "visited", "metrics", "rows", "evaluated_at", "best", "seconds", "saved_rows", "machine",
     )  # fmt: skip
 
-    def __init__(self, s: Settings, folder: Path, device: str = "auto", precision: str = "auto"):
+    def __init__(self, s: Settings, folder: Path, device: str, precision: str):
         self.s, self.folder = s, folder
         self.env, self.eval_env = make_env_of(s), make_env_of(s)
         torch.manual_seed(s.seed + 2**40 * rank())
@@ -656,9 +717,10 @@ class Run:
         returns, lengths = np.concatenate([each for each in scores if each]).T
         names = dict.fromkeys(name for each in metrics for name in each)
         lists = {n: np.concatenate([each[n] for each in metrics if n in each]) for n in names}
+        mean, half = float(returns.mean()), interval95(returns)
         row = {
             "env_steps": self.step, "wall_seconds": self.elapsed(),
-            "eval_return": returns.mean(), "eval_interval95": interval95(returns),
+            "eval_return": mean, "eval_interval95": half,
             "eval_length": lengths.mean(), "eval_length_min": lengths.min(),
             "eval_length_max": lengths.max(), "coverage": coverage(np.concatenate(visited)),
             "train_return": float("nan"), "train_length": float("nan"),  # unless an episode ended
@@ -672,15 +734,14 @@ class Run:
         for name, value in row.items():
             self.writer.add_scalar(name, value, self.step)
         self.writer.flush()
-        spread = f" ± {interval95(returns):.1f}" if len(returns) > 1 else ""
-        said = f"return {returns.mean():.1f}{spread}"
+        said = f"return {mean:.1f}" + (f" ± {half:.1f}" if len(returns) > 1 else "")
         self.bar.set_postfix_str(said)
         self.bar.write(
             f"{self.step:9,} environment steps, {self.elapsed() / 60:5.1f} min: {said}, "
             f"{lengths.mean():.0f} steps an episode"
         )
-        if returns.mean() >= self.best:
-            self.best = float(returns.mean())
+        if mean >= self.best:
+            self.best = mean
             write_whole(self.folder / "best.pt", self.agent.state_dict())
 
     def elapsed(self) -> float:
@@ -688,8 +749,9 @@ class Run:
         return self.seconds + time.monotonic() - self.clock
 
     def save_if_due(self) -> None:
-        """Write a checkpoint every `checkpoint_minutes`, before the ring's reserve is full, and
-        after an evaluation, so that a run which goes on knows of each row and of best.pt."""
+        """Write a checkpoint every `checkpoint_minutes`, before rows of the last one are
+        overwritten, and after an evaluation, so that a run which goes on knows of each row and of
+        best.pt."""
         waited = time.monotonic() - self.clock >= 60 * self.s.checkpoint_minutes
         full = self.replay.added - self.saved_rows >= self.replay.save_every
         if any(gathered(waited or full or self.evaluated_at == self.step)):
@@ -723,7 +785,7 @@ class Run:
                              f"{', '.join(CHANGEABLE)}.")  # fmt: skip
         vars(self).update(saved["kept"])
         self.replay.restore(self.saved_rows, saved["checksums"].numpy())
-        take(self.agent, saved["agent"])
+        load_weights(self.agent, saved["agent"])
         for name, optimiser in self.agent.optimisers.items():
             now_set = optimiser.state_dict()["param_groups"]  # the rate may have changed since
             optimiser.load_state_dict(saved["optimisers"][name] | {"param_groups": now_set})
@@ -760,13 +822,6 @@ class Run:
             "goes on otherwise than it would have.")  # fmt: skip
 
 
-CHECKPOINTS = ("checkpoint.pt", "checkpoint.previous.pt")
-CHANGEABLE = (
-    "steps", "eval_every", "eval_episodes", "eval_max_steps", "checkpoint_minutes", "model_lr",
-    "actor_lr", "critic_lr", "mdn_lr", "grad_clip",
-)  # fmt: skip
-
-
 def fixed_changes(made: dict[str, object], now: dict[str, object]) -> list[str]:
     """What may not change in a run but has: each such setting, and the value that it had."""
     changed = (name for name in now if now[name] != made.get(name))
@@ -787,8 +842,9 @@ def write_whole(path: Path, content: object, keep: Path | None = None) -> None:
 
 
 def read_checkpoint(folder: Path) -> tuple[Path, dict]:
-    """The newest whole checkpoint, and its path, of a moment that all processes have; one killed
-    while it saved may be behind. A ValueError if there is none. Nothing in it is executed."""
+    """The newest whole checkpoint, and its path, of a moment that every process has: one that was
+    killed while it saved may be one behind. A ValueError if there is none. Nothing in it is
+    executed."""
     found = whole_checkpoints(folder)
     moment, path, saved = next(found)
     while len(set(moments := gathered(moment))) > 1:
@@ -817,56 +873,13 @@ def has_checkpoint(folder: Path) -> bool:
     return any((folder / name).exists() for name in CHECKPOINTS)
 
 
-def take(networks: nn.Module, weights: dict[str, Tensor]) -> None:
+def load_weights(networks: nn.Module, weights: dict[str, Tensor]) -> None:
     """Load what was saved. A ValueError, in one sentence, if it is of other networks."""
     try:
         networks.load_state_dict(weights)
     except RuntimeError as error:
         why = " ".join(str(error).split())
         raise ValueError(f"It is of other settings' or another version's networks: {why}") from None
-
-
-def make_env_of(s: Settings):
-    """The environment as an agent of these settings sees it."""
-    return make_env(s.env, s.action_repeat, s.camera_distance, s.floor_brightness)
-
-
-def make_agent(s: Settings, env, device: str = "auto", precision: str = "auto") -> Agent:
-    """An untrained agent; a ValueError if the device is not there or no memory holds it."""
-    if device == "cuda" and not torch.cuda.is_available():
-        raise ValueError("--device cuda: no CUDA device is here; leave it out to use the CPU.")
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-    device = torch.device(device)
-    bfloat16 = precision == "bfloat16"
-    if precision == "auto":
-        bfloat16 = all(gathered(has_bfloat16(device)))  # processes share their gradients' digits
-    try:
-        return Agent(s, env.action_space.shape[0], device, bfloat16)
-    except RuntimeError as error:  # sizes that no memory holds
-        raise ValueError(f"The networks cannot be made: {str(error).splitlines()[0]}") from None
-
-
-@functools.cache
-def has_bfloat16(device: torch.device) -> bool:
-    """Whether bfloat16 products are in the hardware; emulated, they are slow. On some processors
-    that have them PyTorch convolves without them, so one convolution is timed in both."""
-    if device.type == "cuda":
-        return torch.cuda.is_bf16_supported(including_emulation=False)
-    capabilities = torch.cpu.get_capabilities()
-    if not any(capabilities.get(name, False) for name in ("avx512_bf16", "amx_bf16", "bf16")):
-        return False
-    slower = convolution_seconds(torch.bfloat16) / convolution_seconds(torch.float32)
-    if slower > 3:  # about 1 where they are used, 6 where not
-        say(f"Convolutions in bfloat16 are {slower:.0f} times slower here: float32 is used.")
-    return slower <= 3
-
-
-def convolution_seconds(dtype: torch.dtype) -> float:
-    """The least that one of the encoder's takes on this CPU."""
-    x, weight = torch.ones(50, 16, 31, 31, dtype=dtype), torch.ones(32, 16, 4, 4, dtype=dtype)
-    timer = timeit.Timer(lambda: nn.functional.conv2d(x, weight, stride=2))
-    return min(timer.repeat(repeat=20, number=2)) / 2
 
 
 @dataclass(frozen=True)
@@ -885,11 +898,14 @@ class Command:
 
 def parse(arguments: list[str]) -> Command:
     """The command line. The arm and preset, or the run to go on with, set the defaults that the
-    other options change. A ValueError says what cannot be understood."""
+    other options change. A ValueError says what cannot be understood, or cannot be."""
     known = understood([a for a in arguments if a not in ("-h", "--help")], Settings())
-    if known.resume is not None:
-        return understood(arguments, read_settings(folder_named(known.resume)))
-    return understood(arguments, default_settings(known.settings.arm, known.settings.preset))
+    if known.resume is None:
+        default = default_settings(known.settings.arm, known.settings.preset)
+    else:
+        default = read_settings(folder_named(known.resume))
+    command = understood(arguments, default)
+    return dataclasses.replace(command, settings=check(command.settings.to_json()))
 
 
 def understood(arguments: list[str], default: Settings) -> Command:
@@ -959,7 +975,7 @@ def folder_named(text: str) -> Path:
 def new_run(command: Command) -> Run:
     """A new run in a folder of its own, made once all else is known to work. A ValueError says
     what is wrong with the command."""
-    s = check(command.settings.to_json())
+    s = command.settings
     if os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0" and not command.run_dir:
         raise ValueError("--max-restarts needs --run-dir, by which a run that goes on is found.")
     name = f"{s.env}-{s.arm}-{s.preset}-seed{s.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
@@ -990,7 +1006,7 @@ def resumed_run(command: Command) -> Run:
     says why it cannot go on, or not with these."""
     if command.run_dir:
         raise ValueError("--resume keeps the run's own run_dir: leave out --run-dir.")
-    s, folder = check(command.settings.to_json()), folder_named(command.resume)
+    s, folder = command.settings, folder_named(command.resume)
     run = Run(s, folder, command.device, command.precision)
     if not has_checkpoint(run.own):
         whose = f" of {processes()} processes" if rank() else ""
@@ -1006,7 +1022,8 @@ def resumed_run(command: Command) -> Run:
 
 
 def main(arguments: list[str]) -> int:
-    """Runs a command line. Returns the exit code: 0 done, 1 stopped by a fault, 2 bad input."""
+    """Runs a command line. Returns the exit code: 0 done, or stopped as asked; 1 stopped by a
+    fault; 2 bad input."""
     if "--evaluate" in arguments:  # what only looks at a run stands in results/
         player = str(Path(__file__).with_name("results") / "play.py")
         rest = [argument for argument in arguments if argument != "--evaluate"]
@@ -1019,9 +1036,9 @@ def main(arguments: list[str]) -> int:
             sys.stdout = open(os.devnull, "w")  # the first speaks for all
         command = parse(arguments)
         restarted = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"
-        if restarted and command.run_dir:
-            if (folder_named(command.run_dir) / "settings.json").exists():
-                command = dataclasses.replace(command, resume=command.run_dir, run_dir="")
+        folder = folder_named(command.run_dir)
+        if restarted and command.run_dir and (folder / "settings.json").exists():
+            command = dataclasses.replace(command, resume=command.run_dir, run_dir="")
         run = new_run(command) if command.resume is None else resumed_run(command)
     except (ValueError, OSError, MemoryError) as error:
         say(error)

@@ -322,7 +322,7 @@ class WorldModel(nn.Module):
             return torch.ones(state.shape[:-1], device=state.device)
         return torch.sigmoid(-self.termination(state)).squeeze(-1)
 
-    def decoded(self, state: Tensor) -> Tensor:
+    def decoder_input(self, state: Tensor) -> Tensor:
         """What the decoder sees of a state: z alone (§4.2, minor 3), or (h, z)."""
         return state[..., self.deter :] if self.decode_stoch_only else state
 
@@ -353,7 +353,10 @@ class WorldModel(nn.Module):
         seen = torch.ones_like(arrived) if self.observe_first else arrived
         taught = arrived * self.settled(batch["is_first"])
         some = share_of(seen.numel(), self.decode_share, seen.device)
-        shown, pixels = self.decoded(observed.state).flatten(0, 1), batch["image"].flatten(0, 1)
+        shown, pixels = (
+            self.decoder_input(observed.state).flatten(0, 1),
+            batch["image"].flatten(0, 1),
+        )
         image = self.decoder.nll(shown[some], pixels[some])
         terms = {"image": masked_mean(image, seen.flatten()[some])}
         reward = self.predict_reward(observed.state)

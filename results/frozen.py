@@ -33,7 +33,7 @@ def frozen(folder: Path, like: train.Command, seed: int) -> tuple[gym.Env, train
     """A run's environment, an agent with its world model and all else anew, and its replay (of
     several processes, the first one's). A ValueError, in one sentence, if these settings are of
     another model or other experience."""
-    s, made = train.check(like.settings.to_json()), train.read_settings(folder)
+    s, made = like.settings, train.read_settings(folder)
     if other := [name for name in EXPERIENCE if getattr(s, name) != getattr(made, name)]:
         raise ValueError(f"{folder} has its own experience: leave out {', '.join(other)}.")
     saved = train.read_checkpoint(folder)[1]
@@ -41,7 +41,7 @@ def frozen(folder: Path, like: train.Command, seed: int) -> tuple[gym.Env, train
     torch.manual_seed(seed)
     agent = train.make_agent(s, env, like.device, like.precision)
     of_model = (item for item in saved["agent"].items() if item[0].startswith("model."))
-    train.take(agent.model, {name.removeprefix("model."): x for name, x in of_model})
+    train.load_weights(agent.model, {name.removeprefix("model."): x for name, x in of_model})
     replay = Replay(s.replay_capacity, env.action_space.shape[0], folder / "replay.bin")
     replay.restore(saved["kept"]["saved_rows"], saved["checksums"].numpy())
     return env, agent, replay

@@ -47,13 +47,13 @@ def load(folder: Path, checkpoint: str, device: str):
             raise ValueError(f"{folder} has no best.pt: not evaluated yet, or not kept.") from None
         except Exception as error:  # damage has many
             raise ValueError(f"{path} is damaged: {type(error).__name__}.") from None
-    train.take(agent, weights)
+    train.load_weights(agent, weights)
     return s, env, agent, name
 
 
 def pictured(model, states: Tensor) -> Tensor:
     """What the decoder makes of states: (M, D) -> (M, 64, 64, 3), grey levels from 0 to 255."""
-    return (255 * (model.decoder(model.decoded(states)) + 0.5)).clamp(0, 255)
+    return (255 * (model.decoder(model.decoder_input(states)) + 0.5)).clamp(0, 255)
 
 
 @torch.no_grad()

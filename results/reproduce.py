@@ -60,7 +60,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     if low or not command.runs:
         parser.error("--workers: 1 or more; --seeds: 0 or more; --index: one that --list shows.")
     try:  # what the first run cannot have, none can
-        train.check(train.parse(next(iter(command.runs.values()))).settings.to_json())
+        train.parse(next(iter(command.runs.values())))
         if not command.list:
             command.out.mkdir(parents=True, exist_ok=True)
             for folder, options in command.runs.items():

@@ -107,8 +107,8 @@ def random_batch(batch: int, length: int, actions: int) -> dict[str, torch.Tenso
 class TimedAgent(Agent):
     """An agent that keeps the seconds up to the end of each optimiser step, by part."""
 
-    def step(self, name, loss, metrics, count=1):
-        super().step(name, loss, metrics, count)
+    def optimise(self, name, loss, metrics, count=1):
+        super().optimise(name, loss, metrics, count)
         now = clock()
         self.seconds[PARTS[name]] += now - self.clock
         self.clock = now

@@ -147,8 +147,8 @@ def watched_update(s: Settings, watch, bfloat16=False) -> dict[str, float]:
     """One update, of whose every step watch(agent, name, loss, step) makes what it likes."""
     agent = make_agent(s, bfloat16)
     torch.manual_seed(1)
-    step = agent.step
-    agent.step = lambda name, *rest: watch(agent, name, rest[0], lambda: step(name, *rest))
+    step = agent.optimise
+    agent.optimise = lambda name, *rest: watch(agent, name, rest[0], lambda: step(name, *rest))
     return update(agent, make_batch(s), 0.1)
 
 
@@ -377,7 +377,7 @@ def test_a_step_is_adams_on_the_clipped_gradient_of_its_own_loss():
         size = sum(p.numel() for p in parameters)
         for _ in range(2):  # the second does not add to the gradient of the first
             before, metrics = snapshot(agent), {}
-            agent.step(name, sum(7 * p.sum() for p in agent.parameters()), metrics)
+            agent.optimise(name, sum(7 * p.sum() for p in agent.parameters()), metrics)
             norm = metrics[f"{name}/grad_norm"].item()
             assert norm == pytest.approx(7 * math.sqrt(size), rel=1e-4)  # before clipping
             clipped = torch.cat([p.grad.flatten() for p in parameters])
@@ -558,7 +558,7 @@ def test_a_loss_or_gradient_that_is_not_finite_changes_nothing_and_is_refused_by
     no_number = total * math.nan
     steep = (total - total.detach()).abs().sqrt()  # 0, of slope ∞ · 0
     for loss in (no_number, steep, total + math.inf):
-        agent.step(name, loss, metrics := {})
+        agent.optimise(name, loss, metrics := {})
         with pytest.raises(FloatingPointError, match=f"Not finite: .*{name}"):
             as_numbers(metrics)
     after = all_state(agent)
@@ -623,7 +623,7 @@ def test_gradient_passes_through_what_the_policy_sees_unless_it_is_detached(deta
     switch."""
     agent = make_agent(tiny("revised", detach_policy=detach_policy))
     state = torch.randn(5, agent.model.size, requires_grad=True)
-    action = train.dreaming(agent, "stochastic")(state).sum()
+    action = train.dream_policy(agent, "stochastic")(state).sum()
     (gradient,) = torch.autograd.grad(action, state, allow_unused=True)
     assert (gradient is None) == detach_policy
     one, other = (updated(tiny("revised", detach_policy=on))[1] for on in (True, False))
@@ -668,7 +668,7 @@ def test_action_penalty_is_the_sum_of_squares_before_the_bounds(name):
     losses = []
     for penalty in (0.0, 0.5):
         agent = make_agent(tiny("maxent", action_penalty=penalty))
-        last, step = agent.actors[name].net[-1], agent.step
+        last, step = agent.actors[name].net[-1], agent.optimise
         torch.nn.init.zeros_(last.weight)
         torch.nn.init.constant_(last.bias[:ACTIONS], 2.0)
 
@@ -676,7 +676,7 @@ def test_action_penalty_is_the_sum_of_squares_before_the_bounds(name):
             losses.extend([loss.item()] if n == f"{name}_actor" else [])
             step(n, loss, *rest)
 
-        agent.step = watched
+        agent.optimise = watched
         torch.manual_seed(1)
         update(agent, make_batch(agent.s), 0.1)
     assert losses[1] - losses[0] == pytest.approx(0.5 * 4 * ACTIONS, rel=1e-4)

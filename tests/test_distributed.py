@@ -66,14 +66,14 @@ def gradients(batch: dict[str, torch.Tensor], s: Settings) -> dict[str, object]:
     """The gradients of one update, by optimiser, and its metrics. Learning rates are 0, and noise
     is 0.3 everywhere, so that a row has the same noise wherever it stands."""
     agent, found = make_agent(s), {}
-    step = agent.step
+    step = agent.optimise
 
     def recorded(name, *rest) -> None:
         step(name, *rest)
         parameters = agent.optimisers[name].param_groups[0]["params"]
         found[name] = torch.cat([p.grad.flatten() for p in parameters])
 
-    agent.step = recorded
+    agent.optimise = recorded
     noise = {"randn": lambda *size, **_: torch.full(size, 0.3), "randperm": chosen}
     noise["randn_like"] = lambda x: torch.full_like(x, 0.3)
     with pytest.MonkeyPatch.context() as patch:
@@ -132,7 +132,7 @@ def meet_infinity(rank: int, folder: Path) -> None:
     with pytest.raises(FloatingPointError) as stopped:
         update(agent, batch, 0.1)
     loss = sum(p.sum() for p in agent.model.parameters())  # what `masked_mean` does not share
-    agent.step("model", loss + (math.inf if rank == 0 else 0.0), alone := {})
+    agent.optimise("model", loss + (math.inf if rank == 0 else 0.0), alone := {})
     same = all(torch.equal(a, b) for a, b in zip(before, agent.model.parameters(), strict=True))
     found = str(stopped.value), alone["model/grad_norm"].item(), same
     torch.save(found, folder / f"infinity.{rank}")

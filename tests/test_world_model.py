@@ -196,7 +196,7 @@ def test_states_learn_from_all_that_came_before_in_their_episode(by):
 def test_decoder_depends_on_h_only_without_minor_modification_3(stoch_only):
     model = make_model(decode_stoch_only=stoch_only)
     state = torch.randn(2, DETER + STOCH, requires_grad=True)
-    model.decoder(model.decoded(state)).square().sum().backward()
+    model.decoder(model.decoder_input(state)).square().sum().backward()
     assert state.grad[:, :DETER].any() == (not stoch_only)
     assert state.grad[:, DETER:].all()
 
