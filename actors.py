@@ -155,7 +155,7 @@ def act(
         agent: has the world model, `model`, and the `device` where it is.
         policy: states (1, D) to actions (1, A).
         image: (64, 64, 3) uint8.
-        action: (A,), the last one.
+        action: (A,) float32, the last one; zeros before the first.
         state: (1, D), the last one; None at the first image that is looked at.
 
     Returns:
@@ -193,8 +193,8 @@ def drawn_by(seed: int, device: torch.device) -> Iterator[None]:
 
 
 def play(agent, env, policy: Callable, seed: int, most: int) -> Episode:
-    """One episode of a policy, ended after `most` environment steps if it does not end before.
-    Training's random numbers stay as they were."""
+    """One episode of a policy in what `make_env` made, ended after `most` environment steps if it
+    does not end before. Training's random numbers stay as they were."""
     image, _ = env.reset(seed=seed)
     images, actions, states = [image], [np.zeros(env.action_space.shape, np.float32)], [None]
     rewards, over, length = [], False, 0

@@ -26,7 +26,8 @@ class Mixture(NamedTuple):
 
     Its states are about 0 and of about unit size, as h and z are; scale others, lest the floor
     under σ and rounding in `log_prob` count. Another density needs the same two methods and
-    `log_weights`: one that is no mixture has K = 1.
+    `log_weights`: one that is no mixture has K = 1. The network that makes it, states (N, D) to a
+    density, takes the place of `MixtureDensityNetwork` in `train.Agent`.
     """
 
     log_weights: Tensor  # (N, K) log π, normalised
@@ -194,6 +195,7 @@ def particle_entropy(states: Tensor, continues: Tensor, gamma: float, k: int = 3
     following, (weights, tail) = states[1:].float(), discounted_weights(continues.float(), gamma)
     weights = torch.cat([weights[:-1], weights[-1:] + tail])
     starts, size = following.shape[1:]
+    assert starts > k, (starts, k)  # else a state's own draw would be its neighbour
     with torch.no_grad():
         # (N,) which of each start's futures, by the inverse of its w's cumulative sum, which ends
         # at one but for rounding

@@ -25,7 +25,8 @@ def lambda_return(
         (H, N) R_0 … R_{H−1}.
 
     Departure from print: the weights of the unnumbered definition above Eq. (5) sum to
-    1 + λ^T (1 − λ). Eq. (5) is right; this is Eq. (5) as a recursion, with c instead of 1.
+    1 + λ^T (1 − λ). Eq. (5) is right; this is Eq. (5) as a recursion, with c instead of 1. Its T is
+    H here, its G_T^λ is R_0, its r_t is r(s_{t+1}).
     """
     shapes = {x.shape for x in (reward, continues, value)}
     assert len(shapes) == 1, shapes

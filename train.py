@@ -138,7 +138,7 @@ class Settings:
     image_weight: Amount = 1.0  # weight of the image's loss (Dreamer)
     reward_weight: Amount = 1.0  # of the reward's loss (Dreamer)
     termination_weight: Amount = 10.0  # of the termination's loss (Dreamer)
-    kl_weight: Amount = 1.0  # of `kl`, the original Dreamer's divergence (Dreamer)
+    kl_weight: Amount = 1.0  # β of (3): of `kl`, the original Dreamer's divergence (Dreamer)
     kl_standard_weight: Amount = 0.1  # of KL(posterior || N(0, 1)) (§5)
     jeffreys_weight: Amount = 0.1  # of D_J(posterior || prior) (§5)
 
@@ -683,7 +683,7 @@ class Run:
         if over:
             whole = info["episode"]
             self.note({"train_return": whole["r"], "train_length": whole["l"]})
-        self.bar.update(self.step - self.bar.n)
+        self.bar.update(min(self.step, self.s.steps) - self.bar.n)  # the last may be one too many
 
     def note_update(self, metrics: dict[str, float], look: bool) -> None:
         """Count an update that was made; one that was looked at goes to TensorBoard as it is."""
@@ -886,7 +886,8 @@ def load_weights(networks: nn.Module, weights: dict[str, Tensor]) -> None:
 class Command:
     """MaxEnt Dreamer learns to act from 64×64 pixels, in a world that it imagines.
 
-    Values shown are those of the arm and preset on this command line.
+    Values shown are those of the arm and preset on this command line. `--evaluate FOLDER` plays a
+    run instead (results/play.py).
     """
 
     settings: tyro.conf.OmitArgPrefixes[Settings]
@@ -899,7 +900,8 @@ class Command:
 def parse(arguments: list[str]) -> Command:
     """The command line. The arm and preset, or the run to go on with, set the defaults that the
     other options change. A ValueError says what cannot be understood, or cannot be."""
-    known = understood([a for a in arguments if a not in ("-h", "--help")], Settings())
+    words = [a for a in arguments if a not in ("-h", "--help")]
+    known = understood(words, default_settings())
     if known.resume is None:
         default = default_settings(known.settings.arm, known.settings.preset)
     else:
@@ -953,10 +955,13 @@ def check(text: str, where: str = "") -> Settings:
 
 
 def read_settings(folder: Path) -> Settings:
-    """The settings of a run's folder. An OSError if it holds none, a ValueError if
-    they are another version's or cannot be."""
+    """The settings of a run's folder. A ValueError if it holds none, or they are another version's
+    or cannot be."""
     path = folder / "settings.json"
-    text = path.read_text("utf-8-sig", "replace")
+    try:
+        text = path.read_text("utf-8-sig", "replace")
+    except (FileNotFoundError, NotADirectoryError):
+        raise ValueError(f"{folder} is no run's folder: it holds no settings.json.") from None
     s = check(text, f"{path}: ")
     if differing := json.loads(text).keys() ^ dataclasses.asdict(s).keys():
         names = ", ".join(sorted(differing))
@@ -1159,4 +1164,6 @@ if __name__ == "__main__":
     try:
         sys.exit(main(sys.argv[1:]))
     except KeyboardInterrupt:
-        sys.exit("Stopped at once; what the last checkpoint holds can be resumed.")
+        sys.exit(
+            "Stopped at once. A run that had begun goes on from its last checkpoint, by --resume."
+        )

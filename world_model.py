@@ -154,6 +154,7 @@ class Decoder(nn.Module):
 
 def centre(image: Tensor) -> Tensor:
     """uint8 pixels to [−0.5, 0.5]."""
+    assert image.dtype == torch.uint8, image.dtype  # floats would be changed in their own place
     return image.float().div_(255).sub_(0.5)
 
 
@@ -210,6 +211,8 @@ class WorldModel(nn.Module):
         observe_first: z_0 is inferred from o_0, so a_0 depends on it (§4.2). Without it s_0 is
             zero and o_0 is never seen.
         free_nats: KL below which there is nothing to gain (Dreamer); with `fixed_prior` unused.
+
+    The paper's are those of `train.Settings`, what its terms weigh there too.
     """
 
     def __init__(
@@ -425,7 +428,7 @@ def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
     both = torch.stack([(x * mask).sum(), mask.sum()])
     if dist.is_initialized():
         # Both sums' values averaged over the processes that share the batch; of the gradient each
-        # has its own rows' part, and `Agent.step` averages those.
+        # has its own rows' part, and `Agent.optimise` averages those.
         total = both.detach().clone()
         dist.all_reduce(total)
         both = both + (total / dist.get_world_size() - both.detach())

@@ -478,6 +478,11 @@ def test_particle_entropy_takes_no_neighbour_from_its_own_future():
     assert got.item() == pytest.approx(Normal(0, torch.ones(3)).entropy().sum().item(), abs=0.1)
 
 
+def test_particle_entropy_refuses_as_few_starts_as_neighbours():
+    with pytest.raises(AssertionError):
+        particle_entropy(torch.randn(6, 3, 8), torch.ones(5, 3), GAMMA)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_particle_entropy_and_its_gradient_are_finite_where_all_states_are_equal(dtype):
     states = torch.ones(3, 6, 4, dtype=dtype, requires_grad=True)

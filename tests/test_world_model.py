@@ -201,6 +201,13 @@ def test_decoder_depends_on_h_only_without_minor_modification_3(stoch_only):
     assert state.grad[:, DETER:].all()
 
 
+def test_images_that_are_no_bytes_are_refused():
+    """Floats would be centred in their own place, and so once for each network that sees them."""
+    batch = make_batch()
+    with pytest.raises(AssertionError):
+        loss(make_model(), batch | {"image": batch["image"].float()})
+
+
 def test_image_loss_is_minus_the_log_density_of_a_unit_normal_but_for_a_constant():
     """Mean over batch and time, *sum* over the 64·64·3 pixels: the constant is ½ ln 2π a pixel."""
     model, batch = make_model(), make_batch()
