@@ -2,9 +2,10 @@
 
     python results/diagnose.py runs/NAME
 
-plays the evaluation's episodes with each actor, holds what the model says of them against what
-happened, and takes the actions that it dreams of. Prints the figures and a verdict, and draws
-diagnosis-STEP.png in the run's folder. The run may still be going on: nothing of it is changed.
+plays episodes of the evaluation's seeds with each actor (the explorer's actions drawn, as in its
+dreams), holds what the model says of them against what happened, and takes the actions that it
+dreams of. Prints the figures and a verdict, and draws diagnosis-STEP.png in the run's folder. The
+run may still be going on: nothing of it is changed.
 """
 
 import argparse
@@ -69,6 +70,13 @@ def discounted(rewards: np.ndarray, gamma: float) -> np.ndarray:
     return np.array(list(following))[::-1]
 
 
+def known(episode: Episode, gamma: float) -> slice:
+    """The rows of an episode whose return is known: all of one that ended. Of one that was cut off
+    only those long before: a reward 300 decisions ahead counts 0.05 at γ = 0.99."""
+    unknown = 0 if episode.terminated else int(np.log(0.05) / np.log(min(gamma, 0.999)))
+    return slice(0, max(0, len(episode.rewards) - unknown))
+
+
 def windows(x: Tensor, length: int) -> Tensor:
     """(L, …) to (length, L − length + 1, …): every stretch of consecutive rows, time first."""
     return x.unfold(0, length, 1).movedim(-1, 0)
@@ -129,9 +137,7 @@ def measure(agent: Agent, name: str, episode: Episode) -> dict[str, np.ndarray]:
     states = model.observe(images[None], arrived_by[None], is_first[None]).state[0]  # (L + 1, D)
     dream = model.imagine(states[:-1], actor, s.horizon)
     believed = imagined_returns(dream, agent.critics[name], s.gamma, s.lam)[0]
-    # a reward 300 decisions ahead counts 0.05 at γ = 0.99: what a time limit cut off is then little
-    unknown = 0 if episode.terminated else int(np.log(0.05) / np.log(min(s.gamma, 0.999)))
-    known = slice(0, max(0, len(rewards) - unknown))
+    rows = known(episode, s.gamma)
     ended = np.append(np.zeros(len(rewards) - 1), episode.terminated)
     ends = 1 - model.predict_continues(states[1:])
     if model.termination is None:  # it expects none, and cannot: no figure of it says anything
@@ -139,7 +145,7 @@ def measure(agent: Agent, name: str, episode: Episode) -> dict[str, np.ndarray]:
     said = {
         "reward": (model.predict_reward(states[1:]), rewards),
         "terminated": (ends, ended),
-        "return": (believed[known], discounted(rewards, s.gamma)[known]),
+        "return": (believed[rows], discounted(rewards, s.gamma)[rows]),
     }
     found = {key: np.stack([p.cpu().numpy(), real], -1) for key, (p, real) in said.items()}
     if episode.terminated and model.termination is not None:

@@ -4,10 +4,10 @@
 
 takes a run's newest world model and its replay, leaves both as they are, and trains the actor that
 is evaluated (the explorer: --no-deterministic-actor) and its critic from nothing, in dreams of that
-model, under the run's settings or those given. Prints what the actor is promised and what it then
-earns. Settings that earn more in the same model are better for the actors; where all are promised
-more than they earn, the model is at fault, and only other experience mends it. The run is stopped,
-or may be going on.
+model, under the run's settings or those given. Prints what the actor is promised and what then
+came, both discounted, and the returns and lengths of the episodes. Settings that earn more in the
+same model are better for the actors; where all are promised more than comes, the model is at fault,
+and only other experience mends it. The run is stopped, or may be going on.
 """
 
 import argparse
@@ -22,6 +22,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import train
 from actors import play
 from env import Replay
+from results.diagnose import discounted, known
 from results.play import exit_code
 
 EXPERIENCE = (  # settings of what was seen, which only the run itself could change
@@ -71,9 +72,11 @@ def learn(command: argparse.Namespace, settings: list[str]) -> None:
             policy = agent.evaluated.greedy
             seeds = [train.evaluation_seed(k) for k in range(command.episodes)]
             episodes = [play(agent, env, policy, seed, s.eval_max_steps) for seed in seeds]
+            returns = [discounted(e.rewards, s.gamma)[known(e, s.gamma)] for e in episodes]
+            came = f"{np.concatenate(returns).mean():.1f}" if any(map(len, returns)) else "–"
             earned = " ".join(f"{e.total:.0f} ({e.length})" for e in episodes)
-            said = f"promised {np.mean(promised[-50:]):.1f}, discounted; earned {earned}"
-            print(f"{updates} updates: {said}", flush=True)
+            said = f"promised {np.mean(promised[-50:]):.1f}, came {came}, discounted"
+            print(f"{updates} updates: {said}; returns (and lengths): {earned}", flush=True)
 
 
 def main(arguments: list[str]) -> int:

@@ -12,6 +12,8 @@ estimate of the entropy of its future states, which it maximises. Writes FOLDER/
 import argparse
 import csv
 import dataclasses
+import glob
+import itertools
 import json
 import sys
 import textwrap
@@ -32,13 +34,18 @@ from results.play import exit_code
 from train import ARMS, Patient, default_settings, interval95
 
 # What may differ between runs of one line: who, where and how looked at, not what is learnt, nor
-# `eval_max_steps`, on which returns depend.
+# `eval_max_steps`, on which returns depend, nor `eval_every`, on which coverage does.
 NOT_LEARNT = {
-    "env", "seed", "eval_every", "eval_episodes", "checkpoint_minutes",
+    "env", "seed", "eval_episodes", "checkpoint_minutes",
     "run_dir", "device", "precision",  # in files of before 2026-11-25
 }  # fmt: skip
 POLICIES = {"random": ":", "zero": "--", "constant": "-."}  # of reference.csv, and their lines
 GOALS = {"HopperBulletEnv-v0": 800, "HalfCheetahBulletEnv-v0": 300}  # the speed of learning
+
+
+def usual_settings(arm: str, preset: str) -> dict:
+    """Those that a line of that arm does not name; the preset is named if it is not the default."""
+    return dataclasses.asdict(default_settings(arm, preset)) | {"preset": default_settings().preset}
 
 
 def label(settings: dict) -> str:
@@ -46,8 +53,7 @@ def label(settings: dict) -> str:
     another version is held to what it has: a setting that it lacks is not changed."""
     usual = USUAL.get(settings["arm"])  # of no arm of ours, but of baseline.py's
     if usual is None:
-        usual = dataclasses.asdict(default_settings(settings["arm"], settings["preset"]))
-        usual["preset"] = default_settings().preset
+        usual = usual_settings(settings["arm"], settings["preset"])
     changed = [k for k, v in settings.items() if k not in NOT_LEARNT and v != usual.get(k)]
     return ", ".join([settings["arm"]] + [f"{k} {settings[k]}" for k in changed if k != "arm"])
 
@@ -83,7 +89,8 @@ def read_runs(folder: Path) -> dict[str, dict[str, dict[str, dict[str, np.ndarra
     run is, with a word. So are those of an old_view, which is a figure of its own. A ValueError if
     none is left."""
     runs = defaultdict(lambda: defaultdict(dict))
-    for path in sorted(folder.rglob("settings.json")):
+    found = glob.glob("**/settings.json", root_dir=folder, recursive=True)  # also in linked folders
+    for path in sorted(folder / name for name in found):
         place = path.parent.relative_to(folder)
         if "old_view" in place.parts:
             continue
@@ -170,7 +177,8 @@ def draw_env(panels, env: str, arms, reference, colors) -> None:
 def draw(path: Path, runs, reference) -> None:
     """Writes the figure."""
     names = dict.fromkeys([*ARMS, *sorted({name for arms in runs.values() for name in arms})])
-    colors = {name: f"C{k}" for k, name in enumerate(names)}  # an arm has one colour everywhere
+    wheel = [*mpl.colormaps["tab10"].colors, *mpl.colormaps["tab20b"].colors]
+    colors = dict(zip(names, itertools.cycle(wheel)))  # an arm has one colour everywhere
     figure = plt.figure(figsize=(5 * len(runs), 13), layout="constrained")
     panels = figure.subplots(3, len(runs), squeeze=False)
     for (env, arms), column in zip(sorted(runs.items()), panels.T, strict=True):
@@ -212,7 +220,8 @@ def over_seeds(
     *samples: list[float], signs: tuple[float, ...] = (1,)
 ) -> tuple[float, float, float]:
     """Σ sign · IQM of samples, and its 95% percentile bootstrap interval over seeds (Agarwal et al.
-    2021); nan where a sample has a single seed or a nan. Of two seeds it is what lies between."""
+    2021); nan where a sample has a single seed or a nan. Of two or three seeds it reaches from the
+    least to the most."""
 
     def statistic(*samples, axis=-1):
         return sum(sign * iqm(x, axis) for sign, x in zip(signs, samples, strict=True))

@@ -32,12 +32,15 @@ from results.made_with import record
 ROBOTS = ("Hopper", "Walker2D", "HalfCheetah", "Ant")  # of the paper's figure
 TINY = "--deter 16 --stoch 8 --units 16 --depth 2 --mdn-units 16 --horizon 5 --prefill 60 "
 TINY += "--batch-size 3 --length 8 --eval-every 100 --eval-episodes 2 --eval-max-steps 50"
+OWN = ("--steps", "--env", "--arm", "--seed")  # options of train.py that each run is given
 SMOKE = dict(seeds=[0], steps=200, out=Path("runs/smoke"), options=TINY.split())
 
 
 def parse(arguments: list[str]) -> argparse.Namespace:
     """The command line; bad input ends the process with one sentence and exit code 2."""
-    parser = argparse.ArgumentParser(prog="reproduce.py", epilog="After --: options of train.py.")
+    parser = argparse.ArgumentParser(
+        prog="reproduce.py", epilog="After --: options of train.py.", allow_abbrev=False
+    )
     parser.error = lambda text: parser.exit(2, f"{text}\n")
     add, allowed = parser.add_argument, getattr(os, "sched_getaffinity", None)  # not on macOS
     cores = len(allowed(0)) if allowed else os.cpu_count() or 1
@@ -52,8 +55,10 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     add("--smoke", action="store_true", help="all of it with tiny networks, in two minutes")
     parser.set_defaults(**(SMOKE if "--smoke" in arguments else {"options": []}))
     cut = [*arguments, "--"].index("--")
-    command = parser.parse_args(arguments[:cut])
-    command.runs = runs(command, command.options + arguments[cut + 1 :])
+    command, options = parser.parse_args(arguments[:cut]), arguments[cut + 1 :]
+    if own := [a for a in options if a.partition("=")[0] in OWN]:
+        parser.error(f"{own[0]} after --: give --steps, --envs, --arms and --seeds before it.")
+    command.runs = runs(command, command.options + options)
     if command.index is not None:
         command.runs = dict([*command.runs.items()][command.index :][:1])
     low = command.workers < 1 or min(command.seeds) < 0 or (command.index or 0) < 0
@@ -84,8 +89,8 @@ def differing(folder: Path, options: list[str]) -> str:
     """In which settings the run that a folder holds is not of these options, of whichever version
     it is: none, if there is none."""
     try:
-        made = json.loads((folder / "settings.json").read_text())
-    except (OSError, ValueError):  # damaged, and train.py will say so
+        made = dict(json.loads((folder / "settings.json").read_text()))
+    except (OSError, ValueError, TypeError):  # damaged, and train.py will say so
         return ""
     wanted = dataclasses.asdict(train.parse(options).settings)
     now = dict.fromkeys(made) | wanted  # None: a setting of another version's

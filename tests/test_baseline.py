@@ -81,6 +81,21 @@ def test_env_steps_are_counted_through_ends_and_rows_come_when_due(tmp_path, mon
     )
 
 
+@pytest.mark.parametrize("arm", baseline.USUAL)
+def test_coverage_is_of_a_state_each_two_steps(arm, tmp_path, monkeypatch):
+    """As in train.py, whose decisions take two."""
+    covered = []
+    monkeypatch.setattr(baseline, "EVERY", 10)
+    monkeypatch.setattr(baseline, "episode", lambda *_: (1.0, 7))
+    monkeypatch.setattr(baseline, "coverage", lambda states: covered.append(len(states)) or 0.0)
+    settings = {"env": "E-v0", "arm": arm, "seed": 0} | baseline.USUAL[arm] | {"steps": 20}
+    record, going = baseline.Record(settings, tmp_path, None), True
+    while going:
+        info = {"state": np.zeros(2)}
+        going = record({"infos": [info], "dones": [False], "self": None}, {})
+    assert covered == [5, 5]
+
+
 def test_an_hour_ends_a_run_that_has_steps_left(tmp_path, monkeypatch):
     monkeypatch.setattr(baseline, "episode", lambda *_: (1.0, 2))
     settings = {"minutes": 60, "steps": 100, "action_repeat": 2}

@@ -23,6 +23,8 @@ def test_interval_of_two_seeds_is_what_lies_between_and_of_one_there_is_none():
     assert plot.over_seeds([1.0, 5.0]) == (3, 1, 5)
     middle, *interval = plot.over_seeds([4.0], [1.0, 2.0], signs=(1, -1))
     assert middle == 2.5 and np.isnan(interval).all()
+    assert plot.over_seeds([1.0, 2, 6]) == (3, 1, 6)  # nor does it know more of three
+    assert plot.over_seeds([0.0, 1, 2, 100])[0] == 1.5  # of the interquartile mean
     assert plot.shown((2.5, *interval)) == "2.5"
 
 
@@ -128,12 +130,91 @@ def test_runs_are_held_against_those_of_the_same_settings():
     assert "Left out" not in claims.report(runs, plot.read_reference())
 
 
-def test_coverage_without_noise_finds_its_runs():
+def test_a_change_that_an_arm_has_anyway_is_common_to_it_too():
+    """With --no-q-critic `dreamer` stays `dreamer`: it has a V critic as it is."""
+    runs = made_up(dreamer=[1.0, 2, 3], maxent=[7.0, 8, 9], revised=[4.0, 5, 6])
+    for arms in runs.values():
+        for arm in ("maxent", "revised"):
+            arms[f"{arm}, q_critic False"] = arms.pop(arm)
+    assert {"q_critic False"} in claims.shared_changes(runs)
+    text = claims.report(runs, plot.read_reference())
+    assert "| maxent − dreamer: above 0 | 6.0 [4.7, 7.3] | 3, 3 | 100,000 | supported |" in text
+
+
+def test_a_comparison_is_made_where_all_of_its_runs_are():
+    def run(returns):
+        steps = np.array([5_000.0, 10_000, 100_000])[: len(returns)]
+        return {"env_steps": steps, "eval_return": np.array(returns), "coverage": 0 * steps}
+
+    arms = {
+        "revised": {"0": run([10.0, 20, 30]), "1": run([10.0, 20]), "2": run([10.0, 20, 30])},
+        "dreamer": {str(k): run([1.0, 2, 900]) for k in range(3)},
+    }
+    one = claims.above("Hopper", "revised", "dreamer")
+    *_, steps, said = claims.compare(one, arms, frozenset(), plot.read_reference())
+    assert (steps, said) == ("10,000", SUPPORTED)
+
+
+def test_the_margin_is_a_tenth_of_what_the_best_arm_earns_above_random_actions():
+    """Held against the best of the actions that look at nothing."""
+    earn = {"random": 100, "zero": 150, "constant": 120}
+    reference = {("HopperBulletEnv-v0", p): {"return": str(r)} for p, r in earn.items()}
+    arms = made_up(dreamer=[155.0] * 3, maxent=[300.0] * 3)["HopperBulletEnv-v0"]
+    one = claims.Comparison("Hopper", {"dreamer": 1, claims.BLIND: -1}, "not above")
+    where, found, *_, said = claims.compare(one, arms, frozenset(), reference)
+    assert (where, found, said) == ("not above 20", "5.0 [5.0, 5.0]", SUPPORTED)
+
+
+@pytest.mark.parametrize("late_first", [True, False])
+def test_an_arm_that_was_evaluated_later_has_no_part_in_the_margin(late_first):
+    env = "HalfCheetahBulletEnv-v0"
+    arms = made_up(maxent=[700.0, 710, 720], revised=[690.0, 700, 710])[env]
+    late = made_up(dreamer=[-300.0] * 3)[env]
+    for run in late["dreamer"].values():
+        run["env_steps"] = np.array([150_000.0, 200_000])
+    arms = late | arms if late_first else arms | late
+    one = claims.Comparison("HalfCheetah", {"revised": 1, "maxent": -1}, "within")
+    assert claims.compare(one, arms, frozenset(), plot.read_reference())[0] == "within ±180"
+
+
+@pytest.mark.parametrize("returns, said", [
+    ((9.0, 9, 9, 1), SUPPORTED), ((9.0, 9, 1, 1), REFUTED), ((9.0, 9, 9, None), SUPPORTED),
+    ((9.0, 9, None, 1), OPEN), ((9.0, 9, None, None), OPEN),
+])  # fmt: skip
+def test_of_four_comparisons_three_must_hold(returns, said):
+    """Each of `maxent` with 5; None: of a single seed."""
+    runs = {}
+    for robot, value in zip(claims.ROBOTS, returns, strict=True):
+        of = [1.0] if value is None else [value] * 3
+        env = f"{robot}BulletEnv-v0"
+        runs[env] = made_up(maxent=of, revised=[5.0] * 3)[env]
+    group = [(3, [claims.above(robot, "maxent", "revised") for robot in claims.ROBOTS])]
+    assert claims.judge(group, runs, frozenset(), plot.read_reference())[0] == said
+
+
+def test_claims_say_how_many_of_their_comparisons_must_hold():
+    needs = [[(n, len(of)) for n, of in groups] for groups in claims.CLAIMS.values()]
+    assert needs == [[(2, 2)], [(4, 4)], [(3, 3)], [(3, 3)], [(4, 4), (3, 4)], [(8, 8)]]
+
+
+def test_coverage_without_noise_finds_its_runs_and_looks_at_coverage():
     runs = made_up(maxent=[7.0, 8, 9], revised=[1.0, 2, 3])
     for arms in runs.values():
         arms["revised, action_noise 0.0"] = arms["revised"]
     assert judged(runs)[5] == SUPPORTED
     assert "Left out" not in claims.report(runs, plot.read_reference())
+    for run in (run for arms in runs.values() for of in arms.values() for run in of.values()):
+        run["coverage"] = -run["eval_return"]
+    assert judged(runs)[5] == REFUTED
+
+
+def test_runs_that_are_all_without_noise_are_not_counted_twice():
+    runs = made_up(maxent=[7.0, 8, 9], revised=[1.0, 2, 3])
+    for arms in runs.values():
+        for arm in list(arms):
+            arms[f"{arm}, action_noise 0.0"] = arms.pop(arm)
+    text = claims.report(runs, plot.read_reference())
+    assert text.count("| no revised, action_noise 0.0 |") == 4
 
 
 def test_folders_are_judged_and_bad_ones_end_with_one_sentence(tmp_path, capsys):

@@ -3,8 +3,10 @@
 import csv
 import dataclasses
 import json
+import re
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import matplotlib.pyplot as plt
@@ -23,6 +25,7 @@ import results.reference as reference
 import train
 from actors import Episode
 from env import EnvironmentFault, make_env
+from returns import lambda_return
 from train import CHECKPOINTS, Agent, Settings, default_settings, evaluation_seed, main
 
 TINY = dict(
@@ -74,6 +77,75 @@ def test_each_prediction_stands_beside_what_happened_at_its_step():
     np.testing.assert_array_equal(found["open_reward"][2, :, 1], rewards[10:25])
     still = np.square(images[5] - images[5 + 4]).mean()
     np.testing.assert_allclose(found["open_image"][1, 3, 1], still, rtol=1e-5)
+
+
+@pytest.fixture
+def scripted():
+    """An agent in whose row t, seen or dreamt, the state is t, the reward t and the end t / 100,
+    and whose critic says 0; and what its model was asked to observe."""
+    agent = Agent(Settings(**TINY), actions=3, device=torch.device("cpu"), bfloat16=False)
+    model, asked = agent.model, []
+
+    def observe(images, actions, is_first):
+        asked.append((actions[0], is_first[0]))
+        rows = torch.arange(float(images.shape[1]))
+        return SimpleNamespace(state=rows[None, :, None].expand(1, -1, model.size))
+
+    model.observe, model.step = observe, lambda state, action: state + 1
+    model.predict_reward = lambda state: state[..., 0]
+    model.predict_continues = lambda state: 1 - state[..., 0] / 100
+    for critic in agent.critics.values():
+        critic.forward = lambda state, action: 0 * state[..., 0]
+    return agent, asked
+
+
+def test_each_prediction_is_of_the_row_that_it_stands_beside(scripted):
+    (agent, asked), episode = scripted, made_up_episode(30, terminated=True)
+    found = diagnose.measure(agent, "deterministic", episode)
+    ((actions, is_first),) = asked
+    assert not actions[0].any() and is_first.tolist() == [True] + 30 * [False]
+    np.testing.assert_array_equal(actions[1:], episode.actions)
+    rows, gamma = np.arange(1.0, 31), agent.s.gamma
+    np.testing.assert_array_equal(found["reward"][:, 0], rows)
+    np.testing.assert_allclose(found["terminated"][:, 0], rows / 100, atol=1e-6)
+    met = torch.arange(1.0, 6)[:, None] + torch.arange(30.0)  # s_1 … s_5 of each dream
+    promised = lambda_return(met, 1 - met / 100, 0 * met, gamma, agent.s.lam)[0]
+    np.testing.assert_allclose(found["return"][:, 0], promised, rtol=1e-5)
+    came = [sum(gamma**k * r for k, r in enumerate(episode.rewards[t:])) for t in range(30)]
+    np.testing.assert_allclose(found["return"][:, 1], came, rtol=1e-5, atol=1e-5)
+    np.testing.assert_array_equal(found["open_reward"][2, :, 0], np.arange(11.0, 26))
+
+
+def test_a_film_dreams_with_the_actions_that_were_taken(scripted):
+    (agent, _), episode, asked = scripted, made_up_episode(30, terminated=True), []
+    states = torch.arange(30.0)[:, None].expand(30, agent.model.size)
+    along = agent.model.along
+    agent.model.along = lambda *given: asked.append(given) or along(*given)
+    play.open_loop(agent, episode._replace(states=states), frames=25, context=5)
+    ((start, actions),) = asked
+    assert start[0, 0] == 4 and np.array_equal(actions[:, 0], episode.actions[4:24])
+
+
+def test_figures_are_of_the_columns_that_they_name():
+    rng, rows = np.random.default_rng(0), np.arange(6.0)
+    real, wrong = rng.standard_normal(30), 3 * rng.standard_normal(30)
+    dreamt = rows[:, None] * np.arange(1, 16)  # right after a step, wrong by its number later
+    happened = np.tile(rows[:, None], (1, 15))
+    image = np.stack([np.arange(1.0, 16), np.arange(101.0, 116)], -1)[None] ** 2
+    found = {
+        "reward": np.stack([wrong, real], -1), "terminated": np.zeros((30, 2)),
+        "return": np.tile([7.0, 5.0], (4, 1)), "saturated": np.zeros((30, 3)),
+        "greedy": np.zeros((30, 3)), "seen_image": np.full(30, 16.0),
+        "open_reward": np.stack([dreamt, happened], -1), "open_image": image,
+    }  # fmt: skip
+    named = diagnose.figures(found, [made_up_episode(30, terminated=True)])
+    assert (named[diagnose.PROMISED], named[diagnose.EARNED]) == (7, 5)
+    expected = 1 - np.mean((wrong - real) ** 2) / real.var()
+    assert named[diagnose.REWARDS] == pytest.approx(expected)
+    assert named["rewards, R² after 1 step without images"] == 1
+    assert named[diagnose.AFTER] == pytest.approx(1 - np.mean((14 * rows) ** 2) / rows.var())
+    assert named["image error after 15 steps, grey levels of 255"] == 15
+    assert named["the same, of the last image seen for 15 steps"] == 115
 
 
 @pytest.mark.parametrize("name", ["stochastic", "deterministic"])
@@ -407,6 +479,9 @@ def test_fresh_actors_learn_in_a_model_that_stays_as_it_is(trained, actor, capsy
     assert frozen.main([str(trained), *brief, "--no-critic-norm", "--horizon", "4"]) == 0
     said = capsys.readouterr().out.splitlines()
     assert len(said) == 1 and said[0].startswith("2 updates: promised ")
+    assert re.search(
+        r", came (–|[-\d.]+), discounted; returns \(and lengths\): \S+ \(\d+\)$", said[0]
+    )
     assert {path: path.read_bytes() for path in before} == before
     (_, agent, replay), saved = made, torch.load(trained / "checkpoint.pt", weights_only=True)
     assert (agent.s.horizon, agent.s.critic_norm) == (4, False)
@@ -547,10 +622,44 @@ def test_a_run_with_a_switch_of_its_own_is_another_line(tmp_path):
     write_run(tmp_path / "c", "7", seed=1, q_critic=False, preset="paper")
     write_run(tmp_path / "d", "")  # not yet evaluated: left out
     write_run(tmp_path / "e", "9", eval_max_steps=500)  # its returns are of other episodes
+    write_run(tmp_path / "f", "9", eval_every=2500)  # its coverage is of fewer rows
     runs = plot.read_runs(tmp_path)["HopperBulletEnv-v0"]
     assert sorted(runs["maxent"]) == ["0", "1"]
-    (other,) = runs.keys() - {"maxent", "maxent, eval_max_steps 500"}
+    (other,) = runs.keys() - {"maxent", "maxent, eval_max_steps 500", "maxent, eval_every 2500"}
     assert other.startswith("maxent, preset paper") and "q_critic False" in other
+
+
+def test_runs_in_linked_folders_are_drawn_too(tmp_path):
+    write_run(tmp_path / "elsewhere" / "a", "1 2")
+    (tmp_path / "figure").mkdir()
+    (tmp_path / "figure" / "linked").symlink_to(tmp_path / "elsewhere")
+    assert list(plot.read_runs(tmp_path / "figure")["HopperBulletEnv-v0"]) == ["maxent"]
+
+
+def test_each_of_sixteen_arms_has_a_colour_of_its_own(tmp_path, monkeypatch):
+    run = {name: np.ones(1) for name in plot.COLUMNS}
+    colours = []
+    monkeypatch.setattr(plot, "draw_env", lambda *given: colours.extend(given[-1].values()))
+    plot.draw(tmp_path / "a.png", {"E-v0": {f"x {k}": {"0": run} for k in range(12)}}, {})
+    assert len(set(colours)) == len(colours) == 16
+
+
+def test_panels_show_the_mean_and_the_interval_of_what_they_say():
+    def run(k):
+        steps = np.array([1.0, 2])
+        return {"env_steps": steps, "eval_return": steps + k, "coverage": -5 * steps - k}
+
+    panels = plot.plt.figure().subplots(3)
+    arms = {"maxent": {"0": run(0), "1": run(2)}}
+    plot.draw_env(panels, "E-v0", arms, {}, {"maxent": "C3"})
+    half = plot.interval95(np.array([0.0, 2]))
+    for axes, mean in zip(panels[:2], ([2, 3], [-6, -11]), strict=True):
+        (line,) = (line for line in axes.lines if line.get_label().startswith("maxent"))
+        assert line.get_ydata().tolist() == mean
+        band = axes.collections[0].get_paths()[0].vertices[:, 1]
+        assert (band.max(), band.min()) == pytest.approx((max(mean) + half, min(mean) - half))
+    assert [axes.get_ylabel().split()[0] for axes in panels[:2]] == ["evaluation", "coverage"]
+    plot.plt.close("all")
 
 
 def test_an_environment_without_reference_is_drawn_too(tmp_path):
