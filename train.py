@@ -3,9 +3,9 @@
     python train.py --env HopperBulletEnv-v0
 
 `update` is the paper's algorithm and `train` its loop; what they call follows in the order in which
-they call it. The paper ends with `Agent`; from `join_processes` on come processes, folders,
-checkpoints and the command line. No other of the six files reads settings, holds an optimiser or
-knows a run's folder.
+they call it. The paper ends with `Agent`; from `join_processes` on come processes, devices,
+folders, checkpoints and the command line. No other of the six files reads settings, holds an
+optimiser or knows a run's folder.
 """
 
 import atexit
@@ -211,13 +211,10 @@ def update(
     return numbers
 
 
-def as_numbers(metrics: dict[str, Tensor]) -> dict[str, float]:
-    """Metrics as numbers, by one wait for the device. A FloatingPointError if one is not finite."""
-    values = torch.stack([value.detach().float() for value in metrics.values()])
-    numbers = dict(zip(metrics, values.tolist(), strict=True))
-    if wrong := [name for name, number in numbers.items() if not math.isfinite(number)]:
-        raise FloatingPointError(f"Not finite: {', '.join(wrong)}.")
-    return numbers
+def live_rows(agent: "Agent", batch: dict[str, Tensor]) -> Tensor:
+    """Which of a batch's B · T rows dreams may start from: settled ones that are no ends."""
+    live = agent.model.settled(batch["is_first"]) & ~batch["terminated"]
+    return live.flatten().nonzero().squeeze(1)
 
 
 @torch.no_grad()
@@ -230,12 +227,6 @@ def reward_r2(agent: "Agent", states: Tensor, batch: dict[str, Tensor]) -> Tenso
     error = (weight * (agent.model.predict_reward(states) - reward).square()).sum()
     variance = (weight * (reward - (weight * reward).sum()).square()).sum()
     return torch.where(variance > 1e-6, 1 - error / variance, 0.0)
-
-
-def live_rows(agent: "Agent", batch: dict[str, Tensor]) -> Tensor:
-    """Which of a batch's B · T rows dreams may start from: settled ones that are no ends."""
-    live = agent.model.settled(batch["is_first"]) & ~batch["terminated"]
-    return live.flatten().nonzero().squeeze(1)
 
 
 def dream_starts(states: Tensor, live: Tensor, share: float) -> Tensor:
@@ -275,21 +266,6 @@ def update_actor(
         agent.optimise("mdn", loss, metrics, len(starts))
 
 
-@torch.no_grad()
-def actor_metrics(
-    actor: nn.Module, starts: Tensor, dream: Dream, returns: Tensor, name: str
-) -> dict[str, Tensor]:
-    """What the log shows of an actor: what it is promised, and whether its actions still vary."""
-    found = {
-        "return": returns[0].mean(),
-        "saturated": (dream.action.abs() > 0.99).float().mean(),
-        "deviation": actor.greedy(starts).std(0, correction=0).mean(),
-    }
-    if name == "stochastic":
-        found["sigma"] = actor.distribution(starts).stddev.mean()
-    return {f"{name}_actor/{what}": value for what, value in found.items()}
-
-
 def dream_policy(agent: "Agent", name: str) -> Callable[[Tensor], Tensor]:
     """What an actor does in its dreams, states (N, D) to actions (N, A): its action plus
     `dream_noise`; with `detach_policy` no gradient goes back into the states that it sees."""
@@ -318,6 +294,30 @@ def measure_gradients(
         gradients = torch.autograd.grad(term, list(actor.parameters()), retain_graph=True)
         average_over_processes(gradients, count)
         metrics[f"stochastic_actor/{name}_grad_norm"] = nn.utils.get_total_norm(gradients)
+
+
+@torch.no_grad()
+def actor_metrics(
+    actor: nn.Module, starts: Tensor, dream: Dream, returns: Tensor, name: str
+) -> dict[str, Tensor]:
+    """What the log shows of an actor: what it is promised, and whether its actions still vary."""
+    found = {
+        "return": returns[0].mean(),
+        "saturated": (dream.action.abs() > 0.99).float().mean(),
+        "deviation": actor.greedy(starts).std(0, correction=0).mean(),
+    }
+    if name == "stochastic":
+        found["sigma"] = actor.distribution(starts).stddev.mean()
+    return {f"{name}_actor/{what}": value for what, value in found.items()}
+
+
+def as_numbers(metrics: dict[str, Tensor]) -> dict[str, float]:
+    """Metrics as numbers, by one wait for the device. A FloatingPointError if one is not finite."""
+    values = torch.stack([value.detach().float() for value in metrics.values()])
+    numbers = dict(zip(metrics, values.tolist(), strict=True))
+    if wrong := [name for name, number in numbers.items() if not math.isfinite(number)]:
+        raise FloatingPointError(f"Not finite: {', '.join(wrong)}.")
+    return numbers
 
 
 def train(run: "Run", stop: Callable[[], bool]) -> None:
@@ -626,8 +626,8 @@ class Run:
         self.saved_rows = 0  # added to the replay, at the last checkpoint
         precision = "bfloat16" if self.agent.bfloat16 else "float32"
         self.on_cuda = self.agent.device.type == "cuda"
-        chip = torch.backends.cpu.get_cpu_capability()
-        chip = torch.cuda.get_device_name() if self.on_cuda else chip
+        cpu = torch.backends.cpu.get_cpu_capability()
+        chip = torch.cuda.get_device_name() if self.on_cuda else cpu
         self.machine = f"{self.agent.device} ({chip}), {precision}, {torch.get_num_threads()} "
         self.machine += f"threads, torch {torch.__version__}"
         self.machine += f", {processes()} processes" if processes() > 1 else ""
@@ -801,8 +801,11 @@ class Run:
         if not self.over:
             self.retrace()
         torch.set_rng_state(saved["torch_random"])
-        if self.on_cuda and saved["cuda_random"]:  # none, if it was saved on a CPU
-            torch.cuda.set_rng_state(saved["cuda_random"][0])
+        if self.on_cuda and (states := saved["cuda_random"]):  # none, if it was saved on a CPU
+            mine = min(
+                torch.cuda.current_device(), len(states) - 1
+            )  # once they were of all devices
+            torch.cuda.set_rng_state(states[mine])
         for name in CHANGEABLE:
             if now[name] != made[name]:
                 since = f"{name}: {now[name]} instead of {made[name]} from step {self.step:,} on"
@@ -1041,8 +1044,8 @@ def main(arguments: list[str]) -> int:
             sys.stdout = open(os.devnull, "w")  # the first speaks for all
         command = parse(arguments)
         restarted = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"
-        folder = folder_named(command.run_dir)
-        if restarted and command.run_dir and (folder / "settings.json").exists():
+        folder = folder_named(command.run_dir) if restarted and command.run_dir else None
+        if folder and (folder / "settings.json").exists():
             command = dataclasses.replace(command, resume=command.run_dir, run_dir="")
         run = new_run(command) if command.resume is None else resumed_run(command)
     except (ValueError, OSError, MemoryError) as error:
@@ -1075,9 +1078,8 @@ def train_run(run: Run, device: str, precision: str) -> int:
     resume = "Go on with: " + shlex.join(words)
     every = 0.5 if sys.stderr.isatty() else 30  # seconds between two lines of a log file
     try:
-        bar = tqdm(
-            total=s.steps, initial=run.step, unit="step", mininterval=every, disable=rank() > 0
-        )
+        bar = tqdm(total=s.steps, initial=min(run.step, s.steps), unit="step", mininterval=every,
+                   disable=rank() > 0)  # fmt: skip
         with bar as run.bar, SummaryWriter(run.own, purge_step=run.step + 1) as run.writer:
             hangup = getattr(signal, "SIGHUP", signal.SIGINT)  # Windows has none
             for number in (signal.SIGINT, signal.SIGTERM, hangup):

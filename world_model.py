@@ -212,7 +212,8 @@ class WorldModel(nn.Module):
             zero and o_0 is never seen.
         free_nats: KL below which there is nothing to gain (Dreamer); with `fixed_prior` unused.
 
-    The paper's are those of `train.Settings`, what its terms weigh there too.
+    The paper's values of these, and the weights of the terms of `loss`, are the defaults of
+    `train.Settings`.
     """
 
     def __init__(
@@ -356,11 +357,8 @@ class WorldModel(nn.Module):
         seen = torch.ones_like(arrived) if self.observe_first else arrived
         taught = arrived * self.settled(batch["is_first"])
         some = share_of(seen.numel(), self.decode_share, seen.device)
-        shown, pixels = (
-            self.decoder_input(observed.state).flatten(0, 1),
-            batch["image"].flatten(0, 1),
-        )
-        image = self.decoder.nll(shown[some], pixels[some])
+        shown = self.decoder_input(observed.state).flatten(0, 1)[some]
+        image = self.decoder.nll(shown, batch["image"].flatten(0, 1)[some])
         terms = {"image": masked_mean(image, seen.flatten()[some])}
         reward = self.predict_reward(observed.state)
         error = regression_error(reward, batch["reward"], self.smooth_l1)

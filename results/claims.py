@@ -6,8 +6,9 @@ prints, for the runs of results/whole if no folder is given, claim by claim, com
 comparison, what was found: the difference of interquartile means over seeds and its 95% bootstrap
 interval (Agarwal et al. 2021), of what runs earn in the last fifth of the steps that all of them
 made. Supported: the whole interval is where the claim says. Refuted: none of it is. Else, or with
-fewer than three seeds, or none: not enough evidence. An interval of three seeds holds the truth
-four times in five, not 19 in 20: of arms that are equal one comparison in nine is supported.
+fewer than three seeds, or none: not enough evidence. The interval of a difference of three and
+three seeds holds the truth four times in five, not 19 in 20: of equal arms, one "above" in nine is
+supported.
 Beside the claims, what the paper's argument needs: that the explorer covers more of the
 environment's own states.
 """

@@ -284,9 +284,9 @@ def draw_reliability(axes, predicted: np.ndarray, real: np.ndarray, label: str) 
 def draw_metrics(axes, metrics: dict[str, np.ndarray], names: list[str]) -> None:
     """Columns of metrics.csv over environment steps, each on a scale of its own from 0 to 1."""
     for name in names:
-        known = np.isfinite(metrics.get(name, []))
-        if known.any():
-            values, steps = metrics[name][known], metrics["env_steps"][known]
+        finite = np.isfinite(metrics.get(name, []))
+        if finite.any():
+            values, steps = metrics[name][finite], metrics["env_steps"][finite]
             scaled = (values - values.min()) / max(np.ptp(values), 1e-12)
             label = f"{name}: {values.min():.3g} to {values.max():.3g}"
             axes.plot(steps, scaled, "o-" if len(steps) == 1 else "-", label=label)

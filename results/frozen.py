@@ -4,10 +4,11 @@
 
 takes a run's newest world model and its replay, leaves both as they are, and trains the actor that
 is evaluated (the explorer: --no-deterministic-actor) and its critic from nothing, in dreams of that
-model, under the run's settings or those given. Prints what the actor is promised and what then
-came, both discounted, and the returns and lengths of the episodes. Settings that earn more in the
-same model are better for the actors; where all are promised more than comes, the model is at fault,
-and only other experience mends it. The run is stopped, or may be going on.
+model, under the run's settings or those given. Prints what the actor is promised (from the states
+of the replay, with its noise in dreams) and what then came (in episodes of its average), both
+discounted: compare settings, not these two closely. Settings that earn more in the same model are
+better for the actors; where all are promised far more than comes, the model is at fault, or its
+critic, and only other experience mends a model. The run is stopped, or may be going on.
 """
 
 import argparse
@@ -50,8 +51,8 @@ def frozen(folder: Path, like: train.Command, seed: int) -> tuple[gym.Env, train
 
 def learn(command: argparse.Namespace, settings: list[str]) -> None:
     """Trains an actor as that run of train.py would, with the β of its start, and prints a line
-    each `every` updates: promised to the actor itself, earned by its average (`play_rate`), of
-    which after k updates (1 − play_rate)^k is still untrained."""
+    each `every` updates: promised to the actor itself, came and returns of its average
+    (`play_rate`), of which after k updates (1 − play_rate)^k is still untrained."""
     if min(command.updates, command.every, command.episodes) < 1:
         raise ValueError("--updates, --every and --episodes are 1 at least.")
     like = train.parse(["--resume", str(command.folder), *settings])

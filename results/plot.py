@@ -90,7 +90,8 @@ def read_runs(folder: Path) -> dict[str, dict[str, dict[str, dict[str, np.ndarra
     none is left."""
     runs = defaultdict(lambda: defaultdict(dict))
     found = glob.glob("**/settings.json", root_dir=folder, recursive=True)  # also in linked folders
-    for path in sorted(folder / name for name in found):
+    paths = {path.resolve(): path for path in sorted(folder / name for name in found)}
+    for path in paths.values():
         place = path.parent.relative_to(folder)
         if "old_view" in place.parts:
             continue
@@ -220,8 +221,8 @@ def over_seeds(
     *samples: list[float], signs: tuple[float, ...] = (1,)
 ) -> tuple[float, float, float]:
     """Σ sign · IQM of samples, and its 95% percentile bootstrap interval over seeds (Agarwal et al.
-    2021); nan where a sample has a single seed or a nan. Of two or three seeds it reaches from the
-    least to the most."""
+    2021); nan where a sample has a single seed or a nan. Of one sample of two or three seeds it
+    reaches from the least to the most."""
 
     def statistic(*samples, axis=-1):
         return sum(sign * iqm(x, axis) for sign, x in zip(signs, samples, strict=True))

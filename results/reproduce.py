@@ -32,7 +32,7 @@ from results.made_with import record
 ROBOTS = ("Hopper", "Walker2D", "HalfCheetah", "Ant")  # of the paper's figure
 TINY = "--deter 16 --stoch 8 --units 16 --depth 2 --mdn-units 16 --horizon 5 --prefill 60 "
 TINY += "--batch-size 3 --length 8 --eval-every 100 --eval-episodes 2 --eval-max-steps 50"
-OWN = ("--steps", "--env", "--arm", "--seed")  # options of train.py that each run is given
+OWN = ("--steps", "--env", "--arm", "--seed", "--run-dir", "--resume")  # that each run is given
 SMOKE = dict(seeds=[0], steps=200, out=Path("runs/smoke"), options=TINY.split())
 
 
@@ -56,8 +56,10 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     parser.set_defaults(**(SMOKE if "--smoke" in arguments else {"options": []}))
     cut = [*arguments, "--"].index("--")
     command, options = parser.parse_args(arguments[:cut]), arguments[cut + 1 :]
-    if own := [a for a in options if a.partition("=")[0] in OWN]:
-        parser.error(f"{own[0]} after --: give --steps, --envs, --arms and --seeds before it.")
+    if own := [a for a in options if a.partition("=")[0].replace("_", "-") in OWN]:
+        parser.error(
+            f"{own[0]} after --: give --steps, --envs, --arms, --seeds or --out before it."
+        )
     command.runs = runs(command, command.options + options)
     if command.index is not None:
         command.runs = dict([*command.runs.items()][command.index :][:1])

@@ -207,9 +207,8 @@ def test_a_critic_learns_eq2_of_a_chain_with_ends(lam):
         critic_loss(table, imagined, returns.detach(), smooth_l1=False).backward()
         optimiser.step()
     under_policy = follows[torch.arange(3), chosen]
-    matrix = torch.eye(3).double() - GAMMA * continues.double()[under_policy].unsqueeze(
-        1
-    ) * nn.functional.one_hot(under_policy, 3)
+    on = continues.double()[under_policy].diag() @ nn.functional.one_hot(under_policy, 3).double()
+    matrix = torch.eye(3).double() - GAMMA * on
     value = torch.linalg.solve(matrix, reward[under_policy])
     expected = (reward + GAMMA * continues * value)[follows]
     torch.testing.assert_close(table.q.detach(), expected, rtol=1e-4, atol=1e-4)

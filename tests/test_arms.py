@@ -601,7 +601,7 @@ def test_a_model_that_knows_no_numbers_any_more_stops_the_update_and_nothing_mov
 # --- what learning was found to need ---
 
 
-def test_half_of_the_live_states_are_drawn_anew_for_each_update():
+def test_half_of_the_live_states_are_drawn_each_time_for_both_actors():
     s = tiny("maxent", starts=0.5)
     agent, batch, starts = make_agent(s), make_batch(s), []
     imagine = agent.model.imagine
@@ -609,6 +609,7 @@ def test_half_of_the_live_states_are_drawn_anew_for_each_update():
     update(agent, batch, 0.1)
     live = (~batch["terminated"]).flatten().nonzero().squeeze(1)
     assert [len(start) for start in starts] == 2 * [round(len(live) / 2)]
+    assert torch.equal(*starts)
     states, drawn = torch.arange(18.0).view(3, 6, 1), []
     for _ in range(200):
         drawn.append(train.dream_starts(states, live, 0.5).flatten().long())

@@ -116,7 +116,7 @@ def test_smoke_is_all_cells_of_one_seed_in_a_folder_of_its_own():
     (["--seeds", "-1"], "--seeds"), (["--index", "32"], "--index"), (["--index", "-1"], "--index"),
     (["--arms", "warp"], "warp"), (["--bogus"], "--bogus"), (["--out", __file__], "test_"),
     (["--", "--deter", "much"], "--deter"), (["--", "--steps", "5000"], "--steps"),
-    (["--", "--seed=3"], "--seed"), (["--smok"], "--smok"),
+    (["--", "--seed=3"], "--seed"), (["--smok"], "--smok"), (["--", "--run_dir", "x"], "--out"),
 ])  # fmt: skip
 def test_bad_input_ends_with_one_sentence_before_anything_is_made(
     arguments, word, capsys, monkeypatch, tmp_path

@@ -533,7 +533,7 @@ BAD = {
     "--resume nowhere": "nowhere is no run's folder",
     "--resume nowhere --steps 7": "nowhere is no run's folder",
     "--resume /dev/null": "/dev/null is no run's folder",
-    "--prefill many": "default: 2000",  # of the preset asked for, not of the paper's
+    "--prefill many": "default: 2000",  # of `small`, not of the paper's
     "--horizon 1000000": "--horizon",
     "--burn-in 24": "--burn-in",  # of 25 rows
     "--density knn --batch-size 1 --burn-in 18": "--batch-size",
