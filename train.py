@@ -802,10 +802,8 @@ class Run:
             self.retrace()
         torch.set_rng_state(saved["torch_random"])
         if self.on_cuda and (states := saved["cuda_random"]):  # none, if it was saved on a CPU
-            mine = min(
-                torch.cuda.current_device(), len(states) - 1
-            )  # once they were of all devices
-            torch.cuda.set_rng_state(states[mine])
+            mine = torch.cuda.current_device()  # once, checkpoints held those of all devices
+            torch.cuda.set_rng_state(states[min(mine, len(states) - 1)])
         for name in CHANGEABLE:
             if now[name] != made[name]:
                 since = f"{name}: {now[name]} instead of {made[name]} from step {self.step:,} on"
@@ -1044,9 +1042,9 @@ def main(arguments: list[str]) -> int:
             sys.stdout = open(os.devnull, "w")  # the first speaks for all
         command = parse(arguments)
         restarted = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"
-        folder = folder_named(command.run_dir) if restarted and command.run_dir else None
-        if folder and (folder / "settings.json").exists():
-            command = dataclasses.replace(command, resume=command.run_dir, run_dir="")
+        if restarted and command.run_dir:
+            if (folder_named(command.run_dir) / "settings.json").exists():
+                command = dataclasses.replace(command, resume=command.run_dir, run_dir="")
         run = new_run(command) if command.resume is None else resumed_run(command)
     except (ValueError, OSError, MemoryError) as error:
         say(error)
@@ -1166,6 +1164,4 @@ if __name__ == "__main__":
     try:
         sys.exit(main(sys.argv[1:]))
     except KeyboardInterrupt:
-        sys.exit(
-            "Stopped at once. A run that had begun goes on from its last checkpoint, by --resume."
-        )
+        sys.exit("Stopped at once; a run that had begun can be resumed from its last checkpoint.")

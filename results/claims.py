@@ -8,8 +8,7 @@ interval (Agarwal et al. 2021), of what runs earn in the last fifth of the steps
 made. Supported: the whole interval is where the claim says. Refuted: none of it is. Else, or with
 fewer than three seeds, or none: not enough evidence. The interval of a difference of three and
 three seeds holds the truth four times in five, not 19 in 20: of equal arms, one "above" in nine is
-supported.
-Beside the claims, what the paper's argument needs: that the explorer covers more of the
+supported. Beside the claims, what the paper's argument needs: that the explorer covers more of the
 environment's own states.
 """
 
@@ -25,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from results import plot
 from results.play import exit_code
 from results.plot import by_seed, covered, iqm, over_seeds, score
-from train import ARMS, Patient
+from train import ARMS, Patient, default_settings
 
 LEAST = 3  # seeds: of two against two, one pair is above the other by chance once in six
 MARGIN = 0.1  # on par: closer than this share of what the best arm earns above random actions
@@ -95,7 +94,7 @@ def changes(label: str) -> tuple[str, frozenset[str]]:
 
 def changed_in(arm: str, common: frozenset[str]) -> frozenset[str]:
     """Of settings common to all arms, those that this one does not have anyway."""
-    preset = "paper" if "preset paper" in common else plot.default_settings().preset
+    preset = "paper" if "preset paper" in common else default_settings().preset
     return common - {f"{name} {value}" for name, value in plot.usual_settings(arm, preset).items()}
 
 

@@ -463,9 +463,7 @@ def test_nothing_counts_after_an_end_in_what_is_learnt_of_future_states():
     found = []
     for horizon in (1, 3):
         agent = make_agent(tiny("maxent", horizon=horizon, deterministic_actor=False))
-        constant_end = agent.model.termination[-1]
-        torch.nn.init.zeros_(constant_end.weight)
-        torch.nn.init.constant_(constant_end.bias, 200.0)
+        agent.model.predict_continues = lambda state: torch.zeros(state.shape[:-1])
         torch.manual_seed(1)
         metrics = update(agent, make_batch(agent.s), 0.1)
         found.append([metrics["mdn/entropy"], metrics["mdn/nll"]])
@@ -606,10 +604,12 @@ def test_half_of_the_live_states_are_drawn_each_time_for_both_actors():
     agent, batch, starts = make_agent(s), make_batch(s), []
     imagine = agent.model.imagine
     agent.model.imagine = lambda start, *rest: starts.append(start) or imagine(start, *rest)
-    update(agent, batch, 0.1)
+    for _ in range(2):
+        update(agent, batch, 0.1)
     live = (~batch["terminated"]).flatten().nonzero().squeeze(1)
-    assert [len(start) for start in starts] == 2 * [round(len(live) / 2)]
-    assert torch.equal(*starts)
+    assert [len(start) for start in starts] == 4 * [round(len(live) / 2)]
+    assert len(starts[0].unique(dim=0)) == len(starts[0])  # none twice
+    assert torch.equal(*starts[:2]) and not torch.equal(*starts[1:3])
     states, drawn = torch.arange(18.0).view(3, 6, 1), []
     for _ in range(200):
         drawn.append(train.dream_starts(states, live, 0.5).flatten().long())

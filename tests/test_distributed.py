@@ -366,6 +366,17 @@ def test_ctrl_c_saves_in_all_processes_and_says_how_to_go_on(uninterrupted, tmp_
     ends_as(uninterrupted, folder, launcher)
 
 
+@pytest.mark.parametrize("usable", [True, False])
+def test_devices_that_are_seen_and_cannot_be_used_are_not_counted(usable, monkeypatch):
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: usable)
+    monkeypatch.setattr(dist, "is_torchelastic_launched", lambda: True)
+    monkeypatch.setattr(dist, "rendezvous", lambda _: 1 / 0)  # as far as CPUs come here
+    with pytest.raises(ValueError if usable else ZeroDivisionError):
+        train.join_processes()
+
+
 def test_processes_share_an_evaluations_episodes_out(monkeypatch):
     def played(agent, env, policy, seed, most):
         seeds.append(seed)

@@ -634,9 +634,8 @@ def test_runs_in_linked_folders_are_drawn_too(tmp_path):
     (tmp_path / "figure").mkdir()
     (tmp_path / "figure" / "linked").symlink_to(tmp_path / "elsewhere")
     (tmp_path / "figure" / "again").symlink_to(tmp_path / "elsewhere" / "a")  # is no second run
-    (run,) = plot.read_runs(tmp_path / "figure")["HopperBulletEnv-v0"].values()
-    assert len(run) == 1
-    assert list(plot.read_runs(tmp_path / "figure")["HopperBulletEnv-v0"]) == ["maxent"]
+    runs = plot.read_runs(tmp_path / "figure")["HopperBulletEnv-v0"]
+    assert list(runs) == ["maxent"] and len(runs["maxent"]) == 1
 
 
 def test_each_of_sixteen_arms_has_a_colour_of_its_own(tmp_path, monkeypatch):
