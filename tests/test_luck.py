@@ -425,6 +425,14 @@ def test_a_finished_run_can_be_made_longer_and_says_what_changed(stub_run, capsy
     assert rates["stochastic_actor"] == 1e-5 and rates["model"] == 6e-4
 
 
+def test_a_last_decision_that_oversteps_leaves_the_bar_whole(stub_run, capsys):
+    """Of two steps each, 121 end at 122; and a run that is there begins there."""
+    for _ in range(2):
+        assert train.main(["--resume", str(stub_run), "--steps", "121"]) == 0
+        assert "100%" in (said := capsys.readouterr().err) and "121/121" in said
+    assert metrics(stub_run)[-1]["env_steps"] == "122"
+
+
 def test_what_makes_a_run_what_it_is_cannot_be_changed(stub_run, capsys):
     before = contents(stub_run)
     refused(["--resume", stub_run, "--gamma", "0.5"], capsys, "gamma")
