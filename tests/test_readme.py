@@ -2,7 +2,10 @@
 
 import importlib
 import re
+from collections import defaultdict
 from pathlib import Path
+
+from train import ARMS
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -41,12 +44,25 @@ def test_the_table_covers_every_labelled_equation_and_modification():
 
 
 def test_the_table_of_results_is_of_the_last_fifths_that_plot_writes():
+    earned = defaultdict(list)
     for line in (ROOT / "results" / "whole" / "table.md").read_text().splitlines():
-        env, _, seed, *rest = (cell.strip() for cell in line.strip("|").split("|"))
+        env, arm, seed, *rest = cells(line)
         if seed.isdigit():
-            robot = env.removesuffix("BulletEnv-v0")
-            row = next(row for row in README.splitlines() if row.startswith(f"| {robot} |"))
-            assert f" {float(rest[4]):.0f} (seed {seed}" in row, line
+            assert int(seed) == len(earned[env, arm]), line  # 0, 1, 2
+            earned[env, arm].append(f"{float(rest[4]):.0f}".replace("-", "−"))
+    header, _, *rows = README.split("## Status")[1].split("\n\n")[2].splitlines()
+    arms = [arm.strip("`") for arm in cells(header)[1:5]]
+    assert set(arms) == set(ARMS) and len(rows) == 4
+    for robot, *of_arms in map(cells, rows):
+        for arm, cell in zip(arms, of_arms[:4], strict=True):
+            found = earned.pop((f"{robot}BulletEnv-v0", arm), ["–"])
+            assert cell == ", ".join(found), (robot, arm)
+    assert not earned
+
+
+def cells(row: str) -> list[str]:
+    """The cells of a row of a table."""
+    return [cell.strip() for cell in row.strip("|").split("|")]
 
 
 def test_the_table_of_speed_is_what_the_benchmark_printed():
