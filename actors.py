@@ -108,7 +108,7 @@ def actor_loss(returns: Tensor, continues: Tensor, first_state_only: bool) -> Te
 
     First state only (§4.2): −R_0, averaged over the N starting states. The later actions still
     receive gradient, through the imagined sequence that R_0 sums over. Otherwise, as in Dreamer's
-    paper, the mean of S_k R_k over all imagined states, S their survival (Dreamer's code: γ^k R_k).
+    paper, the mean of S_k R_k over all imagined states, S their survival (its code: γ^k S_k R_k).
     """
     if first_state_only:
         return -returns[0].mean()

@@ -80,7 +80,7 @@ class MixtureDensityNetwork(nn.Module):
     def forward(self, state: Tensor) -> Mixture:
         """The mixture given each state: (N, D) -> Mixture."""
         hidden = self.hidden(state)
-        with torch.autocast(state.device.type, enabled=False):  # parameters in float32
+        with torch.autocast(state.device.type, enabled=False):  # π, μ and σ in float32
             out = self.head(hidden.float()).unflatten(-1, (self.components, -1))
         log_weights, mean, std = out.split([1, self.size, self.size], -1)
         return Mixture(log_weights.flatten(1).log_softmax(-1), mean, F.softplus(std) + self.min_std)
@@ -128,9 +128,9 @@ def cross_entropy(
         (N,) in nats.
     """
     weights, tail_weight = discounted_weights(continues, gamma)
-    log_prob = density.log_prob(torch.cat([following, tail.sample_components()]))  # (n + K, N)
-    along, beyond = log_prob[: len(following)], log_prob[len(following) :]
-    return -(weights * along).sum(0) - tail_weight * (tail.log_weights.exp().T * beyond).sum(0)
+    points = torch.cat([following, tail.sample_components()])  # (n + K, N, D)
+    weights = torch.cat([weights, tail_weight * tail.log_weights.exp().T])  # their sum is one
+    return -(weights * density.log_prob(points)).sum(0)
 
 
 def mdn_loss(mdn: MixtureDensityNetwork, states: Tensor, continues: Tensor, gamma: float) -> Tensor:
@@ -145,9 +145,10 @@ def mdn_loss(mdn: MixtureDensityNetwork, states: Tensor, continues: Tensor, gamm
         gamma: γ_q.
     """
     states, continues = states.detach(), continues.detach()  # the data, whatever made them
+    density = mdn(states[0])  # first: older autocasts keep casts that were made without gradient
     with torch.no_grad():
         tail = mdn(states[-1])
-    return cross_entropy(mdn(states[0]), states[1:], continues, tail, gamma)
+    return cross_entropy(density, states[1:], continues, tail, gamma)
 
 
 def entropy(
@@ -155,8 +156,9 @@ def entropy(
 ) -> Tensor:
     """Ĥ of the discounted state distribution, the second term of the objective (7): (N,) nats.
 
-    It is −E_q log P_T = H(q) + KL(q ‖ P_T). Where P_T is q, its gradient in the policy is that of
-    H(q), since KL has its minimum there.
+    It is −E_q log P_T = H(q) + KL(q ‖ P_T). Where P_T is q, KL has its minimum and no gradient, and
+    what is left is that of H(q) in what the policy does up to s_{t+n}. What it does later is frozen
+    in P_T: of a Gaussian chain's gradient 1 − γⁿ is left (tests/test_mdn.py).
 
     Gradient flows to the policy through the imagined states, their c and s̃ ~ P_T(· | s_{t+n}). It
     could not flow through samples of P_T(· | s_t): those do not depend on what the policy does
@@ -198,7 +200,7 @@ def particle_entropy(states: Tensor, continues: Tensor, gamma: float, k: int = 3
     assert starts > k, (starts, k)  # else a state's own draw would be its neighbour
     with torch.no_grad():
         # (N,) which of each start's futures, by the inverse of its w's cumulative sum, which ends
-        # at one but for rounding
+        # at one but for rounding (`multinomial` would wait for a GPU, and raise at a nan)
         drawn = (weights.cumsum(0) < torch.rand(starts, device=weights.device)).sum(0)
         drawn = drawn.clamp(max=len(weights) - 1)
         others = following[drawn, torch.arange(starts, device=drawn.device)]  # (N, d)

@@ -40,10 +40,11 @@ def lambda_return(
 
 
 def survival(continues: Tensor) -> Tensor:
-    """Probability S that an imagined episode has not ended before each state, without gradient.
+    """Probability S_k that a dream gets to s_k and goes on from it, so that a_k is taken, without
+    gradient.
 
-    Losses there are weighted by it. That is ours, and follows from §4.2's termination model;
-    Dreamer's code weights by Π γ.
+    Losses there are weighted by it, which follows from §4.2's termination model. Dreamer's code
+    weights by Π γ c where it learns ends, by Π γ where not.
 
         S_0 = 1;   S_k = c_1 c_2 … c_k
 

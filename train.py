@@ -134,7 +134,7 @@ class Settings:
     mdn_lr: Amount = 2e-4  # of the mixture density network (§5)
     play_rate: Rate = 1.0  # of the moving average of an actor, which plays; 1: itself (ours)
     grad_clip: Annotated[Amount, Interval(gt=0)] = 100.0  # largest norm of a gradient (Dreamer)
-    free_nats: Amount = 3.0  # KL below this costs nothing; of `kl` only (Dreamer)
+    free_nats: Amount = 3.0  # a batch's mean KL below this is as good; of `kl` only (Dreamer)
     image_weight: Amount = 1.0  # weight of the image's loss (Dreamer)
     reward_weight: Amount = 1.0  # of the reward's loss (Dreamer)
     termination_weight: Amount = 10.0  # of the termination's loss (Dreamer)
@@ -212,7 +212,8 @@ def update(
 
 
 def live_rows(agent: "Agent", batch: dict[str, Tensor]) -> Tensor:
-    """Which of a batch's B · T rows dreams may start from: settled ones that are no ends."""
+    """Numbers (L,), of a batch's B · T rows, of those that dreams may start from: settled ones that
+    are no ends."""
     live = agent.model.settled(batch["is_first"]) & ~batch["terminated"]
     return live.flatten().nonzero().squeeze(1)
 
@@ -230,7 +231,7 @@ def reward_r2(agent: "Agent", states: Tensor, batch: dict[str, Tensor]) -> Tenso
 
 
 def dream_starts(states: Tensor, live: Tensor, share: float) -> Tensor:
-    """(N, D): a share of the live ones of a batch's states (B, T, D)."""
+    """(N, D): a share of a batch's states (B, T, D) in its rows `live` (L,)."""
     starts = states.flatten(0, 1)[live].detach()
     return starts[share_of(len(starts), share, starts.device)]
 
@@ -249,10 +250,10 @@ def update_actor(
         if with_entropy:
             metrics["mdn/entropy"] = future_entropy(agent, dream)
             terms["entropy"] = -beta * metrics["mdn/entropy"]
-            if look:
-                measure_gradients(actor, terms, metrics, len(starts))
         penalty = s.action_penalty * actor.raw(starts).square().sum(-1).mean()
         loss = sum(terms.values()) + penalty
+    if with_entropy and look:
+        measure_gradients(actor, terms, metrics, len(starts))
     metrics |= actor_metrics(actor, starts, dream, returns, name)
     agent.optimise(f"{name}_actor", loss, metrics, len(starts))
     with agent.autocast():
@@ -268,7 +269,8 @@ def update_actor(
 
 def dream_policy(agent: "Agent", name: str) -> Callable[[Tensor], Tensor]:
     """What an actor does in its dreams, states (N, D) to actions (N, A): its action plus
-    `dream_noise`; with `detach_policy` no gradient goes back into the states that it sees."""
+    `dream_noise`; with `detach_policy` no gradient goes back into the states that it sees: an actor
+    then learns how its actions change states, not how those change its later actions (Dreamer)."""
     s, actor = agent.s, agent.actors[name]
 
     def policy(state: Tensor) -> Tensor:

@@ -270,7 +270,7 @@ class WorldModel(nn.Module):
         # `observe` takes 68 ms instead of 78 (small preset, one thread).
         with torch.autocast(image.device.type, enabled=False):
             for t in range(length):
-                # h_0 = 0: nothing of the episode before passes, nor of its z, which is in h alone
+                # h_0 = 0: nothing of the episode before passes, nor its z, which comes by h alone
                 deter = going_on[:, t] * self.recur(deter, stoch, action_share[:, t])
                 out = self.posterior_out(F.elu(self.posterior_deter(deter) + embed_share[:, t]))
                 posterior = normal(out)
@@ -339,7 +339,7 @@ class WorldModel(nn.Module):
                          with `ends_ahead`, plus its mean in dreams along the recorded actions
             kl_standard  KL(posterior ‖ N(0, 1)), which gives the prior no gradient (§4.2)
             jeffreys     KL(posterior ‖ prior) + KL(prior ‖ posterior) (§4.2)
-            kl           max(KL(posterior ‖ prior), free nats): Dreamer's, instead of these two
+            kl           max(mean KL(posterior ‖ prior), free nats): Dreamer's, not these two
 
         Departures from print: (4) has the squared errors with the sign of (3)'s log-likelihoods, by
         which they would be maximised; the prior of step t + 1 in (3) lacks the action, which
@@ -386,12 +386,12 @@ class WorldModel(nn.Module):
         """
         length = state.shape[1]
         steps = min(self.ends_ahead, length - 1)
-        first = (length - 1) % steps
-        starts = slice(first, -1, steps)
+        skipped = (length - 1) % steps  # rows before the first dream, as the last ends at the last
+        starts = slice(skipped, -1, steps)
 
         def recorded(name: str) -> Tensor:
             """(B, T, …) -> (steps, N, …): what came, in all N dreams."""
-            rows = batch[name][:, first + 1 :]
+            rows = batch[name][:, skipped + 1 :]
             return rows.unflatten(1, (-1, steps)).flatten(0, 1).transpose(0, 1)
 
         dreamt = self.along(state[:, starts].flatten(0, 1), recorded("action"))[1:]
@@ -430,4 +430,4 @@ def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
         total = both.detach().clone()
         dist.all_reduce(total)
         both = both + (total / dist.get_world_size() - both.detach())
-    return both[0] / both[1].clamp(min=1e-6)  # averaged, a number may be less than 1
+    return both[0] / both[1].clamp(min=1e-6)  # not 1: averaged, a count may be ½

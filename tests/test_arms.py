@@ -770,6 +770,15 @@ def test_both_gradients_of_the_objective_are_measured_when_asked():
     assert abs(parts[0] - parts[1]) <= total * 1.001 and total <= sum(parts) * 1.001
 
 
+@pytest.mark.parametrize("bfloat16", [False, True])
+def test_the_gradient_measured_apart_is_the_one_that_the_actor_follows(bfloat16):
+    s = tiny("maxent", action_penalty=0.0)
+    looked = update(make_agent(s, bfloat16), make_batch(s), 0.0, look=True)  # β = 0: R_0 alone
+    followed = looked["stochastic_actor/grad_norm"]
+    assert looked["stochastic_actor/return_grad_norm"] == pytest.approx(followed, rel=1e-5)
+    assert looked["stochastic_actor/entropy_grad_norm"] == 0
+
+
 def test_reward_r2_is_one_of_exact_predictions_and_leaves_first_rows_out():
     s = tiny("maxent")
     agent, batch = make_agent(s), make_batch(s)
