@@ -27,7 +27,7 @@ from gymnasium import wrappers
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import train
-from env import EnvironmentFault, Foreign, coverage, find_spec
+from env import EnvironmentFault, Foreign, blame, coverage, find_spec
 from results.made_with import made_with
 
 COLUMNS = "env_steps wall_seconds eval_return eval_interval95 eval_length coverage".split()
@@ -42,7 +42,9 @@ def make_world(arm: str, env_id: str) -> gym.Env:
     """The environment, warmed up as train.py's: a step is a decision, info["state"] its state."""
     if arm == "sac-pixels":
         return train.make_env_of(dataclasses.replace(train.default_settings(), env=env_id))
-    world = Foreign(gym.make(find_spec(env_id), render_mode="rgb_array"))
+    with blame(env_id):
+        world = gym.make(find_spec(env_id), render_mode="rgb_array")
+    world = Foreign(world)
     world = wrappers.RecordEpisodeStatistics(world)
     return wrappers.RepeatAction(world, USUAL[arm]["action_repeat"])
 
@@ -112,7 +114,7 @@ def learn(settings: dict, folder: Path, sb3) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """Runs a command line. Returns the exit code: 0 done, 2 bad input."""
+    """Runs a command line. Returns the exit code: 0 done, 2 bad input, 130 Ctrl-C."""
     parser = argparse.ArgumentParser(prog="python results/baseline.py")
     add = parser.add_argument
     add("--from", choices=("states", "pixels"), required=True, dest="sees", help="what SAC sees")
@@ -135,10 +137,14 @@ def main(arguments: list[str]) -> int:
     try:
         if folder.exists():
             raise ValueError(f"{folder} is there already: name another --run-dir.")
+        if min(given.values(), default=1) <= 0:
+            raise ValueError("--steps and --minutes have to be above 0.")
         learn(settings, folder, sb3)
     except (ValueError, OSError, EnvironmentFault) as error:
         print(error, file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        return 130
     return 0
 
 

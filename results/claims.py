@@ -125,7 +125,8 @@ def compare(comparison: Comparison, arms: dict, common, reference) -> tuple[str,
     samples = [by_seed(of, comparison.what, end) for of in runs.values()]
     found = [x + shift for x in over_seeds(*samples, signs=tuple(signs.values()))]
     chosen = [choose(arms, arm, common) for arm in ARMS]
-    best = np.nanmax([iqm(by_seed(of, score, end)) for of in chosen if of])
+    there = [of for of in chosen if of and all(run["env_steps"][-1] >= 0.99 * end for _, run in of)]
+    best = np.nanmax([iqm(by_seed(of, score, end)) for of in there])
     margin = MARGIN * max(0.0, best - blind["random"])
     seeds = [len(sample) for sample in samples]
     said = OPEN if min(seeds) < LEAST else verdict(*found[1:], comparison.lies, margin)

@@ -3,9 +3,10 @@
     python results/diagnose.py runs/NAME
 
 plays episodes of the evaluation's seeds with each actor (the explorer's actions drawn, as in its
-dreams), holds what the model says of them against what happened, and takes the actions that it
-dreams of. Prints the figures and a verdict, and draws diagnosis-STEP.png in the run's folder. The
-run may still be going on: nothing of it is changed.
+dreams; in an arm without another actor also its greedy ones, which evaluations play), holds what
+the model says of them against what happened, and takes the actions that it dreams of. Prints the
+figures and a verdict, and draws diagnosis-STEP.png in the run's folder. The run may still be going
+on: nothing of it is changed.
 """
 
 import argparse
@@ -18,7 +19,7 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from actors import Episode, imagined_returns, play
@@ -27,6 +28,7 @@ from results.plot import read_metrics
 from returns import survival
 from train import Agent, Patient, evaluation_seed
 
+EVALUATED = "evaluated"  # the name of what evaluations play where it is no actor of its own
 LATE = 3  # decisions that a dream may be late with an end
 OPEN_LOOP = 15  # steps that the model is followed without images
 SOON = 5  # the first of these decisions, told apart
@@ -46,6 +48,17 @@ OUTLIVED = f"chance that dreams outlive an end that came by {LATE} decisions"
 PROMISED = "discounted return that the model promised"
 EARNED = "discounted return that then happened"
 AFTER = f"rewards, R² after {OPEN_LOOP} steps without images"
+
+
+class Greedy(nn.Module):
+    """The greedy actions of an explorer, as an actor."""
+
+    def __init__(self, explorer: nn.Module):
+        super().__init__()
+        self.greedy = explorer.greedy
+
+    def forward(self, state: Tensor) -> Tensor:
+        return self.greedy(state)
 
 
 def own_and_taken(decisions: int) -> tuple[str, str]:
@@ -276,6 +289,8 @@ def draw_images(axes, agent: Agent, name: str, episode: Episode) -> None:
 
 def draw_reliability(axes, predicted: np.ndarray, real: np.ndarray, label: str) -> None:
     """How often an episode ended where the model gave its end this probability."""
+    if np.isnan(predicted).all():  # of a model that knows no ends
+        return
     bins = np.digitize(predicted, [0.2, 0.4, 0.6, 0.8])
     points = [(predicted[bins == b].mean(), real[bins == b].mean()) for b in np.unique(bins)]
     axes.plot(*np.array(points).T, "o-", label=f"{label}, {real.sum():.0f} ends")
@@ -324,9 +339,9 @@ def draw(path: Path, agent: Agent, played, found, metrics) -> None:
     for axes in panels[3:5]:
         axes.set_xlabel("steps without images")
     for axes in panels[:5]:
-        if axes.lines:  # episodes shorter than 15 decisions leave two panels empty
+        if axes.get_legend_handles_labels()[0]:  # short episodes leave two panels empty
             axes.legend(fontsize=6)
-    draw_metrics(panels[5], metrics, ["eval_return", "beta", "mdn/entropy", "coverage"])
+    draw_metrics(panels[5], metrics, ["eval_return", "mdn/entropy", "coverage"])
     figure.savefig(path, dpi=100)
 
 
@@ -353,6 +368,8 @@ VERDICTS = (
     # At 0.005 a decision, dreams lose half as much again of what is far off as by γ = 0.99.
     (lambda of: of[EXPECTED] > 2 * of[ENDS] + 0.005 * of[DECISIONS],
      "the model expects ends that do not come: nothing far off counts in its dreams."),
+    (lambda of: of[ENDS] >= 3 and np.isnan(of[EXPECTED]) and exceeds(of, PROMISED, EARNED),
+     "more is promised than earned, and its dreams know no ends: this arm has no model of them."),
     # Of what is promised too much: are the dreams wrong, or what the critic makes of them?
     (lambda of: exceeds(of, PROMISED, EARNED) and exceeds(of, OWN, TAKEN),
      "its dreams earn what their actions do not: the model is wrong about what this actor does."),
@@ -386,14 +403,17 @@ def diagnose(command: argparse.Namespace) -> Path:
     s, env, agent, networks = load(folder, command.checkpoint, command.device)
     played, found, named = {}, {}, {}
     parts = watch_parts(env)
-    for name in agent.actors:
+    if not s.deterministic_actor:
+        agent.players[EVALUATED] = Greedy(agent.players["stochastic"])
+        agent.critics[EVALUATED] = agent.critics["stochastic"]
+    for name in agent.players:
         played[name], found[name] = play_all(agent, env, name, parts, command.episodes)
         named[name] = figures(found[name], played[name])
     print(f"{s.env}, arm {s.arm}, networks {networks}")
     print(f"{'':78}" + "".join(f"{name:>15}" for name in named))
     for key in dict.fromkeys(itertools.chain(*named.values())):
-        values = [f"{of[key]:15.3f}" if key in of else f"{'–':>15}" for of in named.values()]
-        print(f"{key:78}" + "".join(values))
+        values = [of.get(key, np.nan) for of in named.values()]
+        print(f"{key:78}" + "".join("–".rjust(15) if np.isnan(x) else f"{x:15.3f}" for x in values))
     print(verdict(named))
     try:
         metrics = read_metrics(folder / "metrics.csv")

@@ -50,8 +50,8 @@ def frozen(folder: Path, like: train.Command, seed: int) -> tuple[gym.Env, train
 
 
 def learn(command: argparse.Namespace, settings: list[str]) -> None:
-    """Trains an actor as that run of train.py would, with the β of its start, and prints a line
-    each `every` updates: promised to the actor itself, came and returns of its average
+    """Trains an actor as that run of train.py would, with the β of its start. A line each `every`
+    updates and at the end: promised to the actor itself, came and returns of its average
     (`play_rate`), of which after k updates (1 − play_rate)^k is still untrained."""
     if min(command.updates, command.every, command.episodes) < 1:
         raise ValueError("--updates, --every and --episodes are 1 at least.")
@@ -69,7 +69,7 @@ def learn(command: argparse.Namespace, settings: list[str]) -> None:
         train.update_actor(agent, name, starts, s.beta_start, metrics, look=False)
         promised.append(train.as_numbers(metrics)[f"{name}_actor/return"])
         agent.follow()
-        if updates % command.every == 0:
+        if updates % command.every == 0 or updates == command.updates:
             policy = agent.evaluated.greedy
             seeds = [train.evaluation_seed(k) for k in range(command.episodes)]
             episodes = [play(agent, env, policy, seed, s.eval_max_steps) for seed in seeds]

@@ -3,10 +3,11 @@
     python results/plot.py [FOLDER]
 
 draws FOLDER/curves.png (of results/whole, if none is given), one column of panels an environment,
-one line an arm: the mean over its runs and its 95% t-interval, each run as a thin line; above,
-returns of evaluation beside what actions earn that look at nothing; then how much of the
-environment's own state space the collected rows cover; below, that coverage against the agent's own
-estimate of the entropy of its future states, which it maximises. Writes FOLDER/table.md.
+one line an arm: the mean over its runs and, from three runs on, its 95% t-interval, each run as a
+thin line; above, returns of evaluation beside what actions earn that look at nothing; then how much
+of the environment's own state space the collected rows cover; below, that coverage against the
+agent's own estimate of the entropy of its future states, which it maximises. Writes
+FOLDER/table.md.
 """
 
 import argparse
@@ -106,7 +107,13 @@ def read_runs(folder: Path) -> dict[str, dict[str, dict[str, dict[str, np.ndarra
             seeds[f"{name}, {place}" if name in seeds else name] = columns
     if not runs:
         raise ValueError(f"{folder} holds no evaluated run.")
-    return runs
+    names = in_order(runs)
+    return {env: {name: arms[name] for name in names if name in arms} for env, arms in runs.items()}
+
+
+def in_order(runs: dict[str, dict]) -> list[str]:
+    """All experiments' names, the arms of the figure first."""
+    return [*dict.fromkeys([*ARMS, *sorted({name for arms in runs.values() for name in arms})])]
 
 
 def read_reference() -> dict[tuple[str, str], dict[str, str]]:
@@ -127,8 +134,10 @@ def draw_curve(axes, runs: dict[str, dict], column: str, name: str, color: str) 
     steps = first[(first >= low) & (first <= high)]
     values = np.stack([np.interp(steps, r["env_steps"], r[column]) for r in runs.values()])
     mean, half = values.mean(0), np.array([interval95(v) for v in values.T])
-    axes.plot(steps, mean, color=color, label=f"{name}, runs: {len(runs)}")
-    axes.fill_between(steps, mean - half, mean + half, color=color, alpha=0.12, linewidth=0)
+    mark = "o" if len(steps) == 1 else ""
+    axes.plot(steps, mean, mark + "-", color=color, label=f"{name}, runs: {len(runs)}")
+    if len(runs) > 2:  # of two, the interval is six times as wide as they lie apart
+        axes.fill_between(steps, mean - half, mean + half, color=color, alpha=0.12, linewidth=0)
 
 
 def draw_against(axes, runs: dict[str, dict], name: str, color: str) -> None:
@@ -167,19 +176,21 @@ def draw_env(panels, env: str, arms, reference, colors) -> None:
     against.set_visible(any("mdn/entropy" in run for run in runs))
     above.set(title=env, ylabel="evaluation return")
     below.set(xlabel="environment steps", ylabel="coverage of states, nats")
-    against.set(xlabel="Ĥ of states to come, nats", ylabel="coverage of states, nats")
+    against.set(xlabel="Ĥ of states to come, nats; to compare within a run")
+    against.set(ylabel="coverage of states, nats")
     for axes, of in ((below, above), (against, against)):
         lines, labels = of.get_legend_handles_labels()
         labels = [textwrap.fill(text, 60) for text in labels]  # there are arms with many changes
         if lines:
-            axes.legend(lines, labels, fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.2))
+            below_xlabel = dict(loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=5.5)
+            axes.legend(lines, labels, fontsize=7, **below_xlabel)
 
 
 def draw(path: Path, runs, reference) -> None:
     """Writes the figure."""
-    names = dict.fromkeys([*ARMS, *sorted({name for arms in runs.values() for name in arms})])
-    wheel = [*mpl.colormaps["tab10"].colors, *mpl.colormaps["tab20b"].colors]
-    colors = dict(zip(names, itertools.cycle(wheel)))  # an arm has one colour everywhere
+    # The first four, of the arms, are told apart by the colour-blind too.
+    wheel = [*mpl.color_sequences["petroff6"][:4], *mpl.colormaps["tab20b"].colors]
+    colors = dict(zip(in_order(runs), itertools.cycle(wheel)))  # an arm has one colour everywhere
     figure = plt.figure(figsize=(5 * len(runs), 13), layout="constrained")
     panels = figure.subplots(3, len(runs), squeeze=False)
     for (env, arms), column in zip(sorted(runs.items()), panels.T, strict=True):

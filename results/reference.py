@@ -9,6 +9,7 @@ that does in ten. An agent that holds a pose has learnt no more. Rewards do not 
 so none are rendered.
 """
 
+import argparse
 import itertools
 import sys
 from pathlib import Path
@@ -57,6 +58,8 @@ def make(name: str) -> gym.Env:
 
 
 if __name__ == "__main__":
+    says = "Writes results/reference.csv: what actions earn that look at nothing."
+    argparse.ArgumentParser(prog="python results/reference.py", description=says).parse_args()
     lines = ["env,policy,return,interval95,length"]
     for name in ("Hopper", "Walker2D", "HalfCheetah", "Ant"):
         world = make(name)

@@ -147,7 +147,8 @@ def main(arguments: list[str]) -> int:
     if command.list:
         print(*(f"{k} {folder.name}" for k, folder in enumerate(command.runs)), sep="\n")
         return 0
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    hangup = getattr(signal, "SIGHUP", signal.SIGINT)  # Windows has none
+    for number in (signal.SIGINT, signal.SIGTERM, hangup):
         if signal.getsignal(number) != signal.SIG_IGN:  # as nohup has it
             signal.signal(number, lambda number, _: ends.append(number))
     made = {folder: steps_made(folder, command.steps) for folder in command.runs}

@@ -5,6 +5,7 @@ import json
 import sys
 from types import SimpleNamespace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -35,6 +36,30 @@ def test_a_name_that_is_no_environment_leaves_one_sentence_and_no_folder(
     assert capsys.readouterr().err.count("\n") == 1 and not (tmp_path / "a").exists()
     assert baseline.main([*arguments[:-1], str(tmp_path)]) == 2
     assert "there already" in capsys.readouterr().err
+    for wrong in (["--minutes", "0"], ["--steps", "-1"]):
+        assert baseline.main([*arguments, *wrong]) == 2
+        assert "above 0" in capsys.readouterr().err and not (tmp_path / "a").exists()
+
+
+def test_an_environment_that_cannot_be_made_and_ctrl_c_leave_no_traceback(
+    tmp_path, capsys, monkeypatch
+):
+    def fail(*_, **__):
+        raise gym.error.DependencyNotInstalled("no box2d")
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    vector = SimpleNamespace(DummyVecEnv=lambda makers: [make() for make in makers])
+    sb3 = SimpleNamespace(common=SimpleNamespace(vec_env=vector))
+    monkeypatch.setitem(sys.modules, "stable_baselines3", sb3)
+    arguments = ["--from", "states", "--run-dir", str(tmp_path / "a")]
+    with monkeypatch.context() as patch:
+        patch.setattr(baseline.gym, "make", fail)
+        assert baseline.main(arguments) == 2
+    assert "no box2d" in capsys.readouterr().err
+    monkeypatch.setattr(baseline, "learn", interrupt)
+    assert baseline.main(arguments) == 130
 
 
 @pytest.mark.parametrize("arm", baseline.USUAL)

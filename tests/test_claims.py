@@ -165,6 +165,15 @@ def test_the_margin_is_a_tenth_of_what_the_best_arm_earns_above_random_actions()
     assert (where, found, said) == ("not above 20", "5.0 [5.0, 5.0]", SUPPORTED)
 
 
+def test_an_arm_that_stopped_early_has_no_part_in_the_margin():
+    env = "HalfCheetahBulletEnv-v0"
+    arms = made_up(maxent=[700.0, 710, 720], revised=[690.0, 700, 710], dreamer=[9000.0] * 3)[env]
+    for run in arms["dreamer"].values():
+        run["env_steps"] = run["env_steps"] / 4
+    one = claims.Comparison("HalfCheetah", {"revised": 1, "maxent": -1}, "within")
+    assert claims.compare(one, arms, frozenset(), plot.read_reference())[0] == "within ±180"
+
+
 @pytest.mark.parametrize("late_first", [True, False])
 def test_an_arm_that_was_evaluated_later_has_no_part_in_the_margin(late_first):
     env = "HalfCheetahBulletEnv-v0"

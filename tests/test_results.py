@@ -289,6 +289,7 @@ def test_a_run_is_diagnosed_and_left_as_it_is(trained, tmp_path, capsys, monkeyp
     assert {path: path.read_bytes() for path in folder.iterdir() if path != page} == before
     said = capsys.readouterr()
     assert "deterministic" in said.out and diagnose.OWN in said.out and not said.err
+    assert diagnose.EVALUATED not in said.out
     brief, played = [str(folder), "--episodes", "1", "--checkpoint", "best"], {}
     play_all = diagnose.play_all
 
@@ -303,6 +304,27 @@ def test_a_run_is_diagnosed_and_left_as_it_is(trained, tmp_path, capsys, monkeyp
         assert diagnose.main(brief) == 0
     (folder / "metrics.csv").unlink()
     assert diagnose.main(brief) == 0
+
+
+def test_of_an_arm_with_one_actor_what_evaluations_play_is_diagnosed_too(tmp_path, capsys):
+    """Each episode figure of the column `evaluated` is of the greedy actions. An arm without a
+    model of ends has a page and figures too."""
+    s = default_settings("dreamer")
+    s = train.check(dataclasses.replace(s, **TINY, env="HopperBulletEnv-v0").to_json())
+    env = train.make_env_of(s)
+    torch.manual_seed(0)
+    agent = train.make_agent(s, env)
+    (tmp_path / "settings.json").write_text(s.to_json())
+    torch.save(agent.state_dict(), tmp_path / "best.pt")
+    assert diagnose.main([str(tmp_path), "--episodes", "2", "--checkpoint", "best"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].split() == ["stochastic", diagnose.EVALUATED]
+    returns = [episode[0] for episode in train.evaluate(agent, env, lambda _: None)]
+    rows = {line[:78].strip(): line[78:].split() for line in lines[2:]}
+    drawn, greedy = rows["return earned, mean of the episodes"]
+    assert greedy == f"{np.mean(returns):.3f}" != drawn
+    assert rows[diagnose.EXPECTED] == ["–", "–"] and rows[diagnose.SIGMA][1] == "–"
+    assert lines[-2].startswith(f"Look first at the {diagnose.EVALUATED} actor")
 
 
 @pytest.mark.parametrize("length, terminated", [(1, True), (1, False), (15, False), (16, True)])
@@ -392,6 +414,8 @@ GOOD = {
     ({diagnose.EXPECTED: 1}, "see ends coming"),
     ({diagnose.EXPECTED: 0}, "see ends coming"),
     ({diagnose.EXPECTED: np.nan}, "Nothing stands out"),  # a dreamer arm's: it has no model of ends
+    ({diagnose.EXPECTED: np.nan, diagnose.PROMISED: 200}, "know no ends"),
+    ({diagnose.EXPECTED: np.nan, diagnose.PROMISED: 200, diagnose.ENDS: 0}, "promised than earned"),
     ({diagnose.OUTLIVED: 0.7}, "outlive ends"),
     ({diagnose.OUTLIVED: 0.7, diagnose.ENDS: 1, diagnose.EXPECTED: 1}, "Nothing stands out"),
     ({diagnose.EXPECTED: 30}, "do not come"),
@@ -474,14 +498,13 @@ def test_fresh_actors_learn_in_a_model_that_stays_as_it_is(trained, actor, capsy
         return tuple(made)
 
     monkeypatch.setattr(frozen, "frozen", watched)
-    brief = ["--updates", "3", "--every", "2", "--episodes", "1"]
+    brief = ["--updates", "3", "--every", "2", "--episodes", "1"]  # the last with a line too
     brief += ["--no-deterministic-actor"] if actor == "stochastic" else []
     assert frozen.main([str(trained), *brief, "--no-critic-norm", "--horizon", "4"]) == 0
     said = capsys.readouterr().out.splitlines()
-    assert len(said) == 1 and said[0].startswith("2 updates: promised ")
-    assert re.search(
-        r", came (–|[-\d.]+), discounted; returns \(and lengths\): \S+ \(\d+\)$", said[0]
-    )
+    for line, count in zip(said, (2, 3), strict=True):
+        earned = r"came (–|[-\d.]+), discounted; returns \(and lengths\): \S+ \(\d+\)$"
+        assert re.search(rf"^{count} updates: promised .*, {earned}", line)
     assert {path: path.read_bytes() for path in before} == before
     (_, agent, replay), saved = made, torch.load(trained / "checkpoint.pt", weights_only=True)
     assert (agent.s.horizon, agent.s.critic_norm) == (4, False)
@@ -652,13 +675,15 @@ def test_panels_show_the_mean_and_the_interval_of_what_they_say():
         return {"env_steps": steps, "eval_return": steps + k, "coverage": -5 * steps - k}
 
     panels = plot.plt.figure().subplots(3)
-    arms = {"maxent": {"0": run(0), "1": run(2)}}
-    plot.draw_env(panels, "E-v0", arms, {}, {"maxent": "C3"})
-    half = plot.interval95(np.array([0.0, 2]))
+    arms = {"maxent": {"0": run(0), "1": run(2), "2": run(1)}}
+    arms["dreamer"] = {"0": run(0), "1": run(1)}
+    plot.draw_env(panels, "E-v0", arms, {}, {"maxent": "C3", "dreamer": "C0"})
+    half = plot.interval95(np.array([0.0, 2, 1]))
     for axes, mean in zip(panels[:2], ([2, 3], [-6, -11]), strict=True):
         (line,) = (line for line in axes.lines if line.get_label().startswith("maxent"))
         assert line.get_ydata().tolist() == mean
-        band = axes.collections[0].get_paths()[0].vertices[:, 1]
+        (band,) = axes.collections  # none of two runs
+        band = band.get_paths()[0].vertices[:, 1]
         assert (band.max(), band.min()) == pytest.approx((max(mean) + half, min(mean) - half))
     assert [axes.get_ylabel().split()[0] for axes in panels[:2]] == ["evaluation", "coverage"]
     plot.plt.close("all")
