@@ -23,7 +23,9 @@ def one_seed():
 @pytest.fixture(autouse=True)
 def handlers():
     """A run that is trained in this process, a fixture's too, takes them and keeps them."""
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup ignores it; a run leaves it so
+    for number in BEFORE:  # nohup and a shell's background ignore some, and a run leaves them so
+        usual = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+        signal.signal(number, usual)
     yield
     for number, handler in BEFORE.items():
         signal.signal(number, handler)

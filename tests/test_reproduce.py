@@ -50,15 +50,6 @@ for name in ("settings.json", "weights.pt"):
 """
 
 
-@pytest.fixture(autouse=True)
-def usual_signals():
-    numbers = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
-    before = [signal.signal(number, signal.default_int_handler) for number in numbers]
-    yield
-    for number, handler in zip(numbers, before, strict=True):
-        signal.signal(number, handler)
-
-
 @pytest.fixture
 def stand_in(tmp_path, monkeypatch) -> Path:
     """An empty folder for runs that the stand-in makes; nothing is drawn of them."""
@@ -257,7 +248,7 @@ def test_two_cells_are_trained_and_drawn_and_those_of_others_left_alone(tmp_path
 @pytest.mark.parametrize("number", [
     signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow),
 ])  # fmt: skip
-def test_a_signal_saves_the_real_thing_for_the_next_call(number, tmp_path):
+def test_a_signal_saves_the_real_thing(number, tmp_path):
     line = [sys.executable, str(SCRIPT), "--smoke", *NARROW, "--steps", "9000", "--out",
             str(tmp_path), "--workers", "1"]  # fmt: skip
     first, second = (tmp_path / f"{HOPPER}-{arm}-seed0" for arm in ("revised", "maxent"))

@@ -585,16 +585,6 @@ def test_what_goes_wrong_is_an_exit_code_and_no_traceback(error, code, capsys):
     assert capsys.readouterr().err == ("" if code == 130 else "x\n")
 
 
-def test_an_environment_that_fails_ends_with_its_own_sentence(trained, capsys, monkeypatch):
-    def fails(*_):
-        raise EnvironmentFault("Hopper raised a fault.")
-
-    for program in (play, diagnose):
-        monkeypatch.setattr(program, "play", fails)
-        assert program.main([str(trained)]) == 1
-        assert capsys.readouterr().err == "Hopper raised a fault.\n"
-
-
 @pytest.mark.parametrize("fps", [30, 50, 70, 12.5])
 def test_a_film_lasts_as_long_as_what_it_shows(fps, tmp_path):
     pictures = np.random.default_rng(0).integers(0, 256, (3, 60, 64, 64, 3), np.uint8)
@@ -607,14 +597,13 @@ def test_a_film_lasts_as_long_as_what_it_shows(fps, tmp_path):
     assert min(shown) >= play.SHORTEST and sum(shown) == pytest.approx(60_000 / fps, abs=10)
 
 
-def test_a_film_keeps_real_time_and_its_colours(tmp_path):
+def test_a_film_keeps_its_colours(tmp_path):
     pictures = np.zeros((3, 100, 64, 64, 3), np.uint8)
     pictures[0, :, :32] = (0, 180, 0)  # green above, a little of it
     for k in range(100):
         pictures[1, k, k // 2] = (250, 200, 10)  # a line that falls: no two frames are the same
-    play.film(tmp_path / "a.gif", pictures, fps=100)  # 10 ms a frame: every other one is shown
+    play.film(tmp_path / "a.gif", pictures, fps=100)
     with Image.open(tmp_path / "a.gif") as gif:
-        assert gif.info["duration"] == 20 and gif.n_frames <= 50
         pixel = np.array(gif.convert("RGB").getpixel((60, 60)), int)
         assert np.abs(pixel - (0, 180, 0)).max() < 12
 
@@ -699,10 +688,9 @@ def test_an_environment_without_reference_is_drawn_too(tmp_path):
     ("Hopper", "700 800 9 900", "800: 2"), ("Hopper", "700 799", "800: –"),
     ("HalfCheetah", "-9 20 301", "300: 3"), ("Ant", "900", "–"),
 ])  # fmt: skip
-def test_the_table_tells_when_a_return_was_first_reached(robot, returns, says, tmp_path, capsys):
+def test_the_table_tells_when_a_return_was_first_reached(robot, returns, says, tmp_path):
     write_run(tmp_path / "a", returns, env=f"{robot}BulletEnv-v0")
-    assert plot.main([str(tmp_path)]) == 0
-    (row,) = [x for x in capsys.readouterr().out.splitlines() if "| maxent |" in x]
+    row = plot.table(plot.read_runs(tmp_path), {}).splitlines()[-1]
     assert row.endswith(f"| {says} |")
 
 
@@ -745,6 +733,7 @@ def test_runs_that_never_overlap_are_drawn_without_a_mean(tmp_path, capsys):
     path.write_text(path.read_text().replace("\n5000,", "\n70000,"))
     assert plot.main([str(tmp_path)]) == 0
     assert "maxent | 1 |" in capsys.readouterr().out
+    assert not any(x.size for x in drawn(plot.read_runs(tmp_path)["HopperBulletEnv-v0"]["maxent"]))
 
 
 def test_one_evaluation_of_one_episode_has_a_mark_and_no_interval(tmp_path, capsys):
@@ -753,6 +742,11 @@ def test_one_evaluation_of_one_episode_has_a_mark_and_no_interval(tmp_path, caps
     path.write_text(path.read_text().replace("7,1,9", "7,nan,9"))
     assert plot.main([str(tmp_path)]) == 0
     assert "| 7.0 | 7.0 |" in capsys.readouterr().out
+    axes = plt.figure().subplots()
+    runs = plot.read_runs(tmp_path)["HopperBulletEnv-v0"]["maxent"]
+    plot.draw_curve(axes, runs, "eval_return", "maxent", "C0")
+    assert {line.get_marker() for line in axes.lines} == {"o"}
+    plt.close("all")
 
 
 def test_settings_of_another_version_are_named_by_what_they_hold(tmp_path):
@@ -781,10 +775,9 @@ def test_what_is_no_run_is_left_out_with_a_word(file, content, tmp_path, capsys)
     write_run(tmp_path / "a", "1 2")
     write_run(tmp_path / "b", "3 4", seed=1)
     (tmp_path / "b" / file).write_text(content)
-    assert plot.main([str(tmp_path)]) == 0
-    said = capsys.readouterr()
-    assert "maxent | 0 |" in said.out and "maxent | 1 |" not in said.out
-    assert len(said.err.splitlines()) == 1 and str(tmp_path / "b" / file) in said.err
+    assert [*plot.read_runs(tmp_path)["HopperBulletEnv-v0"]["maxent"]] == ["0"]
+    (said,) = capsys.readouterr().err.splitlines()
+    assert str(tmp_path / "b" / file) in said
 
 
 @pytest.mark.parametrize("cut", [1, 2, 8])

@@ -453,7 +453,10 @@ def test_rows_of_which_too_little_was_seen_teach_no_reward_and_no_end():
     before, _ = loss(model, batch)
     for name, wrong in (("reward", batch["reward"] + 50), ("terminated", ~batch["terminated"])):
         term = {"reward": "reward", "terminated": "termination"}[name]
-        for row, counts in (((2, 0), False), ((2, 1), False), ((2, 2), True), ((0, 1), True)):
+        for row, counts in (
+            ((2, 0), False), ((2, 1), False), ((2, 2), True),
+            ((0, 0), False), ((0, 1), True), ((1, 3), False), ((1, 4), True),  # first ones
+        ):  # fmt: skip
             changed = batch[name].clone()
             changed[row] = wrong[row]
             same = loss(model, batch | {name: changed})[0][term] == before[term]
@@ -533,19 +536,6 @@ def test_continues_is_one_minus_the_probability_of_the_end():
     torch.testing.assert_close(model.predict_continues(torch.randn(5, 12)), torch.full((5,), 0.25))
     terminal = batch | {"terminated": torch.ones_like(batch["terminated"])}
     assert loss(model, terminal)[0]["termination"].item() == pytest.approx(-math.log(3 / 4))
-
-
-def test_reward_and_termination_losses_ignore_first_rows_and_no_other():
-    model, batch = make_model(), make_batch()
-    before, _ = loss(model, batch)
-    for name, wrong in (("reward", batch["reward"] + 50), ("terminated", ~batch["terminated"])):
-        term = {"reward": "reward", "terminated": "termination"}[name]
-        on_first = batch | {name: torch.where(batch["is_first"], wrong, batch[name])}
-        assert loss(model, on_first)[0][term] == before[term]
-        for row in ((0, 1), (1, 4), (2, 5)):
-            changed = batch[name].clone()
-            changed[row] = wrong[row]
-            assert loss(model, batch | {name: changed})[0][term] != before[term], row
 
 
 def test_without_termination_nothing_ends():
