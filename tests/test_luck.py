@@ -11,13 +11,13 @@ import subprocess
 import sys
 import zipfile
 from pathlib import Path
-from typing import ClassVar
 
 import filelock
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from conftest import Base
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
 from scipy import stats
@@ -26,42 +26,6 @@ from test_train import LONG, TINY, command, metrics, one_sentence, run, start, w
 import train
 
 FAST = [*TINY, "--steps", "120", "--eval-every", "60", "--eval-episodes", "1"]
-
-
-class Base(gym.Env):
-    """Ends after 20 steps, each worth 1."""
-
-    metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 30}
-    action_space, observation_space = Box(-1, 1, (2,), np.float32), Box(-10, 10, (3,), np.float32)
-
-    def __init__(self, render_mode=None):
-        self.render_mode, self.t, self.steps = render_mode, 0, 0
-
-    def obs(self):
-        return self.np_random.normal(size=3).astype(np.float32)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t = 0
-        return self.obs(), {}
-
-    def step(self, action):
-        self.t, self.steps = self.t + 1, self.steps + 1
-        return self.obs(), 1.0, self.t >= 20, False, {}
-
-    def render(self):
-        image = np.zeros((64, 64, 3), np.uint8)
-        image[min(self.t, 63)] = 255
-        return image
-
-
-@pytest.fixture
-def register(monkeypatch):
-    def register(entry_point, name="Stub-v0") -> str:
-        monkeypatch.setitem(gym.registry, name, EnvSpec(name, entry_point))
-        return name
-
-    return register
 
 
 @pytest.fixture(scope="module")
@@ -297,7 +261,7 @@ def test_an_environment_that_fails_in_an_evaluation_stops_nothing(register, tmp_
 class Repeats(Second):
     """Its episodes of 50 steps are the same in each process."""
 
-    image, reward = 0, 0.1  # what is not the same in another one
+    tint, reward = 0, 0.1  # what is not the same in another one
 
     def step(self, action):
         obs, _, _, truncated, info = super().step(action)
@@ -305,7 +269,7 @@ class Repeats(Second):
         return obs, reward, self.t >= 50, truncated, info
 
     def render(self):
-        return super().render() | np.uint8(0 if self.number <= 2 else self.image)
+        return super().render() | np.uint8(0 if self.number <= 2 else self.tint)
 
 
 class OtherReward(Repeats):
@@ -313,7 +277,7 @@ class OtherReward(Repeats):
 
 
 class OtherImage(Repeats):
-    image = 1
+    tint = 1
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from gymnasium.envs.registration import EnvSpec
 from scipy import stats
 
 import actors
@@ -91,9 +90,8 @@ class NumPyEnv(gym.Env):
 
 
 @pytest.fixture
-def numpy_env(monkeypatch):
-    spec = EnvSpec("NumPy-v0", NumPyEnv, max_episode_steps=50)
-    monkeypatch.setitem(gym.registry, "NumPy-v0", spec)
+def numpy_env(register):
+    register(NumPyEnv, "NumPy-v0")
 
 
 # ---- training ------------------------------------------------------------------------------------
@@ -249,10 +247,10 @@ class Told(gym.Env):
         return np.full((64, 64, 3), len(self.rows) % 256, np.uint8)
 
 
-def test_a_run_stores_what_happened_and_learns_when_it_is_due(tmp_path, monkeypatch):
+def test_a_run_stores_what_happened_and_learns_when_it_is_due(tmp_path, monkeypatch, register):
     """A truncation is no termination, an image stands beside the action that led to it, no two
     episodes have one seed, prefill is uniform, and β is that of the step."""
-    monkeypatch.setitem(gym.registry, "Told-v0", EnvSpec("Told-v0", Told))
+    register(Told, "Told-v0")
     monkeypatch.setattr(Told, "made", [])
     betas, views, update, make = [], [], train.update, train.make_env
 
