@@ -134,7 +134,7 @@ class Settings:
     mdn_lr: Amount = 2e-4  # of the mixture density network (§5)
     play_rate: Rate = 1.0  # of the moving average of an actor, which plays; 1: itself (ours)
     grad_clip: Annotated[Amount, Interval(gt=0)] = 100.0  # largest norm of a gradient (Dreamer)
-    free_nats: Amount = 3.0  # a batch's mean KL below this is as good; of `kl` only (Dreamer)
+    free_nats: Amount = 3.0  # a batch's mean KL counts as this at least; of `kl` only (Dreamer)
     image_weight: Amount = 1.0  # weight of the image's loss (Dreamer)
     reward_weight: Amount = 1.0  # of the reward's loss (Dreamer)
     termination_weight: Amount = 10.0  # of the termination's loss (Dreamer)

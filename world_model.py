@@ -339,7 +339,7 @@ class WorldModel(nn.Module):
                          with `ends_ahead`, plus its mean in dreams along the recorded actions
             kl_standard  KL(posterior ‖ N(0, 1)), which gives the prior no gradient (§4.2)
             jeffreys     KL(posterior ‖ prior) + KL(prior ‖ posterior) (§4.2)
-            kl           max(mean KL(posterior ‖ prior), free nats): Dreamer's, not these two
+            kl           max(mean KL(posterior ‖ prior), free nats): Dreamer's, in their place
 
         Departures from print: (4) has the squared errors with the sign of (3)'s log-likelihoods, by
         which they would be maximised; the prior of step t + 1 in (3) lacks the action, which

@@ -29,6 +29,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import train
 from env import EnvironmentFault, Foreign, blame, coverage, find_spec
 from results.made_with import made_with
+from results.play import exit_code
 
 COLUMNS = "env_steps wall_seconds eval_return eval_interval95 eval_length coverage".split()
 EVERY, EPISODES, STACK, ROWS = 5_000, 10, 3, 50_000  # ROWS: of a replay of images, 4 GB
@@ -39,12 +40,15 @@ USUAL = {  # by its name in plot.py, what its settings.json holds beside env and
 
 
 def make_world(arm: str, env_id: str) -> gym.Env:
-    """The environment, warmed up as train.py's: a step is a decision, info["state"] its state."""
+    """The environment, warmed up as train.py's: a step is a decision, info["state"] its state. A
+    ValueError if there is none of that name, or it cannot be made."""
     if arm == "sac-pixels":
         return train.make_env_of(dataclasses.replace(train.default_settings(), env=env_id))
-    with blame(env_id):
-        world = gym.make(find_spec(env_id), render_mode="rgb_array")
-    world = Foreign(world)
+    try:
+        with blame(env_id):
+            world = Foreign(gym.make(find_spec(env_id), render_mode="rgb_array"))
+    except EnvironmentFault as error:
+        raise ValueError(str(error)) from error
     world = wrappers.RecordEpisodeStatistics(world)
     return wrappers.RepeatAction(world, USUAL[arm]["action_repeat"])
 
@@ -98,7 +102,12 @@ class Record:
 
 
 def learn(settings: dict, folder: Path, sb3) -> None:
-    """A run of SB3's SAC from beginning to end, in a folder that it makes."""
+    """A run of SB3's SAC from beginning to end, in a folder that it makes. A ValueError if there is
+    one already, or nothing to do."""
+    if folder.exists():
+        raise ValueError(f"{folder} is there already: name another --run-dir.")
+    if any(settings[of] is not None and settings[of] <= 0 for of in ("steps", "minutes")):
+        raise ValueError("--steps and --minutes have to be above 0.")
     arm, vector = settings["arm"], sb3.common.vec_env
     worlds = [vector.DummyVecEnv([lambda: make_world(arm, settings["env"])]) for _ in range(2)]
     own = {"policy": "MlpPolicy"}
@@ -114,7 +123,7 @@ def learn(settings: dict, folder: Path, sb3) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """Runs a command line. Returns the exit code: 0 done, 2 bad input, 130 Ctrl-C."""
+    """Runs a command line. Returns its `exit_code`; 2 also without Stable-Baselines3."""
     parser = argparse.ArgumentParser(prog="python results/baseline.py")
     add = parser.add_argument
     add("--from", choices=("states", "pixels"), required=True, dest="sees", help="what SAC sees")
@@ -134,18 +143,7 @@ def main(arguments: list[str]) -> int:
     except ImportError:
         print("Stable-Baselines3 is not here: pip install stable-baselines3.", file=sys.stderr)
         return 2
-    try:
-        if folder.exists():
-            raise ValueError(f"{folder} is there already: name another --run-dir.")
-        if min(given.values(), default=1) <= 0:
-            raise ValueError("--steps and --minutes have to be above 0.")
-        learn(settings, folder, sb3)
-    except (ValueError, OSError, EnvironmentFault) as error:
-        print(error, file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return 130
-    return 0
+    return exit_code(lambda: learn(settings, folder, sb3))
 
 
 if __name__ == "__main__":

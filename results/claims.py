@@ -27,7 +27,8 @@ from results.plot import by_seed, covered, iqm, over_seeds, score
 from train import ARMS, Patient, default_settings
 
 LEAST = 3  # seeds: of two against two, one pair is above the other by chance once in six
-MARGIN = 0.1  # on par: closer than this share of what the best arm earns above random actions
+MARGIN = 0.1  # on par: closer than this share of what the best arm that got as far earns above
+# random actions
 SUPPORTED, REFUTED, OPEN = "supported", "refuted", "not enough evidence"
 HOPPER, WALKER, CHEETAH, ANT = ROBOTS = ("Hopper", "Walker2D", "HalfCheetah", "Ant")
 BLIND = "best blind action"  # of reference.csv: the most that actions earn that look at nothing
@@ -125,8 +126,8 @@ def compare(comparison: Comparison, arms: dict, common, reference) -> tuple[str,
     samples = [by_seed(of, comparison.what, end) for of in runs.values()]
     found = [x + shift for x in over_seeds(*samples, signs=tuple(signs.values()))]
     chosen = [choose(arms, arm, common) for arm in ARMS]
-    there = [of for of in chosen if of and all(run["env_steps"][-1] >= 0.99 * end for _, run in of)]
-    best = np.nanmax([iqm(by_seed(of, score, end)) for of in there])
+    as_far = [of for of in chosen if of and min(r["env_steps"][-1] for _, r in of) >= 0.99 * end]
+    best = np.nanmax([iqm(by_seed(of, score, end)) for of in as_far])
     margin = MARGIN * max(0.0, best - blind["random"])
     seeds = [len(sample) for sample in samples]
     said = OPEN if min(seeds) < LEAST else verdict(*found[1:], comparison.lies, margin)

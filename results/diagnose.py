@@ -339,7 +339,7 @@ def draw(path: Path, agent: Agent, played, found, metrics) -> None:
     for axes in panels[3:5]:
         axes.set_xlabel("steps without images")
     for axes in panels[:5]:
-        if axes.get_legend_handles_labels()[0]:  # short episodes leave two panels empty
+        if axes.get_legend_handles_labels()[0]:  # short episodes and no ends leave some empty
             axes.legend(fontsize=6)
     draw_metrics(panels[5], metrics, ["eval_return", "mdn/entropy", "coverage"])
     figure.savefig(path, dpi=100)
@@ -369,7 +369,7 @@ VERDICTS = (
     (lambda of: of[EXPECTED] > 2 * of[ENDS] + 0.005 * of[DECISIONS],
      "the model expects ends that do not come: nothing far off counts in its dreams."),
     (lambda of: of[ENDS] >= 3 and np.isnan(of[EXPECTED]) and exceeds(of, PROMISED, EARNED),
-     "more is promised than earned, and its dreams know no ends: this arm has no model of them."),
+     "more is promised than earned, and its dreams know no ends: --termination learns them."),
     # Of what is promised too much: are the dreams wrong, or what the critic makes of them?
     (lambda of: exceeds(of, PROMISED, EARNED) and exceeds(of, OWN, TAKEN),
      "its dreams earn what their actions do not: the model is wrong about what this actor does."),
@@ -405,7 +405,7 @@ def diagnose(command: argparse.Namespace) -> Path:
     parts = watch_parts(env)
     if not s.deterministic_actor:
         agent.players[EVALUATED] = Greedy(agent.players["stochastic"])
-        agent.critics[EVALUATED] = agent.critics["stochastic"]
+        agent.critics[EVALUATED] = agent.critics["stochastic"]  # which is of drawn actions
     for name in agent.players:
         played[name], found[name] = play_all(agent, env, name, parts, command.episodes)
         named[name] = figures(found[name], played[name])

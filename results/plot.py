@@ -136,7 +136,7 @@ def draw_curve(axes, runs: dict[str, dict], column: str, name: str, color: str) 
     mean, half = values.mean(0), np.array([interval95(v) for v in values.T])
     mark = "o" if len(steps) == 1 else ""
     axes.plot(steps, mean, mark + "-", color=color, label=f"{name}, runs: {len(runs)}")
-    if len(runs) > 2:  # of two, the interval is six times as wide as they lie apart
+    if len(runs) > 2:  # of two, it reaches six times as far either way as they lie apart
         axes.fill_between(steps, mean - half, mean + half, color=color, alpha=0.12, linewidth=0)
 
 
@@ -168,7 +168,7 @@ def draw_env(panels, env: str, arms, reference, colors) -> None:
             draw_curve(axes, of, column, name, colors[name])
         values = np.concatenate([run[column] for run in runs])
         values = [*values[np.isfinite(values)], *(earned.values() if axes is above else ())]
-        if values:  # an interval over two runs may leave the panel
+        if values:  # an interval may leave the panel
             margin = 0.1 * np.ptp(values) + 1
             axes.set_ylim(min(values) - margin, max(values) + margin)
     for name, of in arms.items():
@@ -188,8 +188,9 @@ def draw_env(panels, env: str, arms, reference, colors) -> None:
 
 def draw(path: Path, runs, reference) -> None:
     """Writes the figure."""
-    # The first four, of the arms, are told apart by the colour-blind too.
-    wheel = [*mpl.color_sequences["petroff6"][:4], *mpl.colormaps["tab20b"].colors]
+    # The first four, of the arms, are told apart by the colour-blind too; then hue after hue.
+    others = mpl.colormaps["tab20b"].colors  # five hues, four shades each
+    wheel = [*mpl.color_sequences["petroff6"][:4], *(c for k in range(4) for c in others[k::4])]
     colors = dict(zip(in_order(runs), itertools.cycle(wheel)))  # an arm has one colour everywhere
     figure = plt.figure(figsize=(5 * len(runs), 13), layout="constrained")
     panels = figure.subplots(3, len(runs), squeeze=False)

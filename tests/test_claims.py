@@ -168,8 +168,7 @@ def test_the_margin_is_a_tenth_of_what_the_best_arm_earns_above_random_actions()
 def test_an_arm_that_stopped_early_has_no_part_in_the_margin():
     env = "HalfCheetahBulletEnv-v0"
     arms = made_up(maxent=[700.0, 710, 720], revised=[690.0, 700, 710], dreamer=[9000.0] * 3)[env]
-    for run in arms["dreamer"].values():
-        run["env_steps"] = run["env_steps"] / 4
+    arms["dreamer"]["0"]["env_steps"] = arms["dreamer"]["0"]["env_steps"] / 4  # not all got as far
     one = claims.Comparison("HalfCheetah", {"revised": 1, "maxent": -1}, "within")
     assert claims.compare(one, arms, frozenset(), plot.read_reference())[0] == "within ±180"
 

@@ -118,7 +118,7 @@ def test_action_repeat_sums_rewards_and_stops_at_the_episodes_end(make):
     """Doing nothing, Hopper falls after 57 of its own steps from this seed: 28 and a half pairs."""
     still = np.zeros((100, 3), np.float32)
     _, single, terminated, truncated, info = play(make(IDS[0], 1), 5, still)
-    assert terminated and not truncated and info["episode"]["l"] == len(single)
+    assert terminated and not truncated and info["episode"]["l"] == len(single) == 57
     _, rewards, terminated, truncated, info = play(make(IDS[0], 2), 5, still)
     sums = [single[i : i + 2].sum() for i in range(0, len(single), 2)]
     np.testing.assert_allclose(rewards, sums)

@@ -49,7 +49,7 @@ def test_the_table_of_results_is_of_the_last_fifths_that_plot_writes():
         env, arm, seed, *rest = cells(line)
         if seed.isdigit():
             assert int(seed) == len(earned[env, arm]), line  # 0, 1, 2
-            earned[env, arm].append(f"{float(rest[4]):.0f}".replace("-", "−"))
+            earned[env, arm].append(f"{float(rest[4]):,.0f}".replace("-", "−"))
     header, _, *rows = README.split("## Status")[1].split("\n\n")[2].splitlines()
     arms = [arm.strip("`") for arm in cells(header)[1:5]]
     assert set(arms) == set(ARMS) and len(rows) == 4
