@@ -188,9 +188,9 @@ def draw_env(panels, env: str, arms, reference, colors) -> None:
 
 def draw(path: Path, runs, reference) -> None:
     """Writes the figure."""
-    # The first four, of the arms, are told apart by the colour-blind too; then hue after hue.
-    others = mpl.colormaps["tab20b"].colors  # five hues, four shades each
-    wheel = [*mpl.color_sequences["petroff6"][:4], *(c for k in range(4) for c in others[k::4])]
+    # The first four, of the arms, are told apart by the colour-blind too.
+    palettes = mpl.color_sequences
+    wheel = [*palettes["petroff6"][:4], *palettes["Dark2"], *palettes["Set3"]]
     colors = dict(zip(in_order(runs), itertools.cycle(wheel)))  # an arm has one colour everywhere
     figure = plt.figure(figsize=(5 * len(runs), 13), layout="constrained")
     panels = figure.subplots(3, len(runs), squeeze=False)
