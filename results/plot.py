@@ -190,7 +190,7 @@ def draw(path: Path, runs, reference) -> None:
     """Writes the figure."""
     # The first four, of the arms, are told apart by the colour-blind too.
     palettes = mpl.color_sequences
-    wheel = [*palettes["petroff6"][:4], *palettes["Dark2"], *palettes["Set3"]]
+    wheel = [*palettes["petroff6"][:4], *palettes["Dark2"], *palettes["tab10"]]
     colors = dict(zip(in_order(runs), itertools.cycle(wheel)))  # an arm has one colour everywhere
     figure = plt.figure(figsize=(5 * len(runs), 13), layout="constrained")
     panels = figure.subplots(3, len(runs), squeeze=False)
