@@ -2,9 +2,9 @@
 
 import importlib
 import re
-from collections import defaultdict
 from pathlib import Path
 
+import results.plot as plot
 from train import ARMS
 
 ROOT = Path(__file__).parent.parent
@@ -43,13 +43,13 @@ def test_the_table_covers_every_labelled_equation_and_modification():
     assert "minor 3" in TABLE and "minor 4" in TABLE
 
 
-def test_the_table_of_results_is_of_the_last_fifths_that_plot_writes():
-    earned = defaultdict(list)
-    for line in (ROOT / "results" / "whole" / "table.md").read_text().splitlines():
-        env, arm, seed, *rest = cells(line)
-        if seed.isdigit():
-            assert int(seed) == len(earned[env, arm]), line  # 0, 1, 2
-            earned[env, arm].append(f"{float(rest[4]):,.0f}".replace("-", "−"))
+def test_the_table_of_results_is_of_the_last_fifths_of_the_whole_runs():
+    earned = {}
+    for env, arms in plot.read_runs(plot.WHOLE).items():
+        for arm, runs in arms.items():
+            assert sorted(runs) == [str(seed) for seed in range(len(runs))]  # 0, 1, 2
+            scores = [plot.score(run, run["env_steps"][-1]) for _, run in sorted(runs.items())]
+            earned[env, arm] = [f"{score:,.0f}".replace("-", "−") for score in scores]
     header, _, *rows = README.split("## Status")[1].split("\n\n")[2].splitlines()
     arms = [arm.strip("`") for arm in cells(header)[1:5]]
     assert set(arms) == set(ARMS) and len(rows) == 4
