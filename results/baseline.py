@@ -45,8 +45,10 @@ def make_world(arm: str, env_id: str) -> gym.Env:
     if arm == "sac-pixels":
         return train.make_env_of(dataclasses.replace(train.default_settings(), env=env_id))
     try:
+        spec = find_spec(env_id)
         with blame(env_id):
-            world = Foreign(gym.make(find_spec(env_id), render_mode="rgb_array"))
+            world = gym.make(spec, render_mode="rgb_array")
+        world = Foreign(world)
     except EnvironmentFault as error:
         raise ValueError(str(error)) from error
     world = wrappers.RecordEpisodeStatistics(world)

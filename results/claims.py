@@ -27,8 +27,7 @@ from results.plot import by_seed, covered, iqm, over_seeds, score
 from train import ARMS, Patient, default_settings
 
 LEAST = 3  # seeds: of two against two, one pair is above the other by chance once in six
-MARGIN = 0.1  # on par: closer than this share of what the best arm that got as far earns above
-# random actions
+MARGIN = 0.1  # on par: this share of what the best arm that got as far earns above random actions
 SUPPORTED, REFUTED, OPEN = "supported", "refuted", "not enough evidence"
 HOPPER, WALKER, CHEETAH, ANT = ROBOTS = ("Hopper", "Walker2D", "HalfCheetah", "Ant")
 BLIND = "best blind action"  # of reference.csv: the most that actions earn that look at nothing

@@ -33,7 +33,9 @@ def test_a_name_that_is_no_environment_leaves_one_sentence_and_no_folder(
     monkeypatch.setitem(sys.modules, "stable_baselines3", sb3)
     arguments = ["--from", sees, "--env", "Hoper-v0", "--run-dir", str(tmp_path / "a")]
     assert baseline.main(arguments) == 2
-    assert capsys.readouterr().err.count("\n") == 1 and not (tmp_path / "a").exists()
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and said.endswith("?\n") and said.count("Hoper-v0") <= 1
+    assert not (tmp_path / "a").exists()
     assert baseline.main([*arguments[:-1], str(tmp_path)]) == 2
     assert "there already" in capsys.readouterr().err
     for wrong in (["--minutes", "0"], ["--steps", "-1"]):

@@ -598,13 +598,14 @@ def test_a_film_lasts_as_long_as_what_it_shows(fps, tmp_path):
     assert min(shown) >= play.SHORTEST and sum(shown) == pytest.approx(60_000 / fps, abs=10)
 
 
-def test_a_film_keeps_its_colours(tmp_path):
+def test_a_film_keeps_real_time_and_its_colours(tmp_path):
     pictures = np.zeros((3, 100, 64, 64, 3), np.uint8)
     pictures[0, :, :32] = (0, 180, 0)  # green above, a little of it
     for k in range(100):
         pictures[1, k, k // 2] = (250, 200, 10)  # a line that falls: no two frames are the same
-    play.film(tmp_path / "a.gif", pictures, fps=100)
+    play.film(tmp_path / "a.gif", pictures, fps=100)  # 10 ms a frame: every other one is shown
     with Image.open(tmp_path / "a.gif") as gif:
+        assert gif.info["duration"] == 20 and gif.n_frames <= 50
         pixel = np.array(gif.convert("RGB").getpixel((60, 60)), int)
         assert np.abs(pixel - (0, 180, 0)).max() < 12
 
