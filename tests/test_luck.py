@@ -21,7 +21,7 @@ from conftest import Base
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
 from scipy import stats
-from test_train import LONG, TINY, command, metrics, one_sentence, run, start, wait_for
+from test_train import LONG, TINY, command, metrics, one_sentence, start, wait_for
 
 import train
 
@@ -498,19 +498,6 @@ def test_a_reader_who_goes_away_stops_nothing(ending, tmp_path, module):
     assert done.returncode == 0 and len(metrics(folder)) == 2
 
 
-@pytest.mark.slow
-def test_a_schedulers_signal_saves_as_ctrl_c_does(tmp_path):
-    folder = tmp_path / "a folder with spaces"
-    process = start("--run-dir", folder, *LONG)
-    wait_for(folder / "checkpoint.previous.pt", process)
-    process.send_signal(signal.SIGTERM)
-    said, errors = process.communicate()
-    assert process.returncode == 0, errors
-    advice = shlex.split(said.split("Go on with: ")[1])
-    assert Path(advice[0]) == Path(sys.executable) and advice[-1] == str(folder)
-    assert run(*advice[2:], "--steps", 400).returncode == 0  # the advice, pasted
-
-
 # ---- files that are damaged or edited ------------------------------------------------------------
 
 
@@ -605,11 +592,17 @@ def test_metrics_that_were_damaged_are_written_anew_with_the_next_row(damage, st
     assert first == before and last["env_steps"] == "180" and [*last.values()].count("nan") < 5
 
 
-def test_a_run_without_checkpoints_is_refused_and_left_as_it_is(stub_run, capsys):
-    for name in (*train.CHECKPOINTS, "replay.bin", "run.lock"):
-        (stub_run / name).unlink(missing_ok=True)
+@pytest.mark.parametrize("damage", ["gone", "damaged"])
+def test_a_run_without_whole_checkpoints_is_refused_and_left_as_it_is(damage, stub_run, capsys):
+    for path in [stub_run / name for name in (*train.CHECKPOINTS, "replay.bin", "run.lock")]:
+        if damage == "gone":
+            path.unlink(missing_ok=True)
+        elif path.suffix == ".pt":
+            path.write_bytes(b"damaged")
     before = contents(stub_run)
-    refused(["--resume", stub_run, "--steps", "180"], capsys, "no whole checkpoint")
+    for _ in range(2):
+        assert train.main(["--resume", str(stub_run), "--steps", "180"]) == 2
+        assert "no whole checkpoint" in capsys.readouterr().err.splitlines()[-1]
     assert contents(stub_run) == before
 
 

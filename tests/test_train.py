@@ -8,7 +8,6 @@ import os
 import random
 import re
 import resource
-import shutil
 import signal
 import subprocess
 import sys
@@ -375,73 +374,16 @@ def test_a_run_killed_twenty_times_equals_one_never_interrupted(tmp_path):
     assert metrics(tmp_path / "run") == metrics(tmp_path / "whole")
 
 
-@pytest.fixture(scope="module")
-def interrupted(tmp_path_factory) -> tuple[Path, str]:
-    """A run that was ended by Ctrl-C after two checkpoints, and what it said."""
-    folder = tmp_path_factory.mktemp("runs") / "interrupted"
+def test_ctrl_c_saves_and_says_how_to_go_on(uninterrupted, tmp_path):
+    folder = tmp_path / "run"
     process = start("--run-dir", folder, *LONG)
     wait_for(folder / "checkpoint.previous.pt", process)
     process.send_signal(signal.SIGINT)
     said, errors = process.communicate()
     assert process.returncode == 0, errors
-    return folder, said
-
-
-def test_ctrl_c_saves_and_says_how_to_go_on(uninterrupted, interrupted, tmp_path):
-    folder, said = interrupted
     assert f"--resume {folder}" in said
-    folder = shutil.copytree(folder, tmp_path / "run")
     assert run("--resume", folder).returncode == 0
     assert metrics(folder) == metrics(uninterrupted)
-
-
-def test_a_damaged_checkpoint_is_named_and_the_one_before_it_taken(
-    uninterrupted, interrupted, tmp_path, capsys
-):
-    folder = shutil.copytree(interrupted[0], tmp_path / "run")
-    newest = folder / "checkpoint.pt"
-    newest.write_bytes(newest.read_bytes()[:1000])
-    assert main(["--resume", str(folder)]) == 0
-    assert f"{newest} is damaged" in capsys.readouterr().err
-    assert metrics(folder) == metrics(uninterrupted)
-
-
-def test_a_run_without_a_whole_checkpoint_is_refused_and_left_as_it_is(interrupted, tmp_path):
-    folder = shutil.copytree(interrupted[0], tmp_path / "run")
-    for name in ("checkpoint.pt", "checkpoint.previous.pt"):
-        (folder / name).write_bytes(b"damaged")
-    before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    for _ in range(2):
-        assert main(["--resume", str(folder)]) == 2
-    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
-
-
-def test_whose_turn_it_is_is_resumed(tmp_path, monkeypatch, numpy_env):
-    monkeypatch.setattr("train.TURN", 4)  # of an episode's seven steps
-    folder, noted, load = tmp_path / "run", train.Run.note_decision, train.Run.load
-    turns = []
-
-    def noting(run, *given):
-        noted(run, *given)
-        if not run.explores and run.length == 6:
-            run.save()
-            turns.append((run.step, run.lead))
-            raise KeyboardInterrupt
-
-    def loading(run):
-        load(run)
-        assert not run.explores
-        turns.append((run.step, run.lead))
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("train.Run.note_decision", noting)
-    arguments = ["--env", "NumPy-v0", "--steps", "140", "--collect", "both"]
-    with pytest.raises(KeyboardInterrupt):
-        main([*arguments, "--run-dir", str(folder), *TINY])
-    monkeypatch.setattr("train.Run.load", loading)
-    with pytest.raises(KeyboardInterrupt):
-        main(["--resume", str(folder)])
-    assert turns[0] == turns[1] and turns[0][1] != 0
 
 
 def test_a_run_whose_replay_has_wrapped_around_can_be_resumed(tmp_path):
