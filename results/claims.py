@@ -8,8 +8,8 @@ interval (Agarwal et al. 2021), of what runs earn in the last fifth of the steps
 made. Supported: the whole interval is where the claim says. Refuted: none of it is. Else, or with
 fewer than three seeds, or none: not enough evidence. The interval of a difference of three and
 three seeds holds the truth four times in five, not 19 in 20: of equal arms, one "above" in nine is
-supported. Beside the claims, what the paper's argument needs: that the explorer covers more of the
-environment's own states.
+supported. Beside the claims, what the paper's argument needs: that `maxent` covers more of the
+environment's own states than `revised`, in `small` with equal noise on both explorers' actions.
 """
 
 import argparse
@@ -68,9 +68,8 @@ CLAIMS = {  # each a list of (how many of them must hold, comparisons)
         (4, [above(robot, "maxent", "dreamer") for robot in ROBOTS]),
         (3, [Comparison(robot, MAJORITY, "above") for robot in ROBOTS]),
     ],
-    "The explorer covers more of the environment's states than noise does, and than none": [
-        (8, [above(robot, "maxent", other, covered) for robot in ROBOTS
-             for other in ("revised", "revised, action_noise 0.0")])
+    "What is collected covers more of the environment's states than without exploration": [
+        (4, [above(robot, "maxent", "revised", covered) for robot in ROBOTS])
     ],
 }  # fmt: skip
 
@@ -92,22 +91,16 @@ def changes(label: str) -> tuple[str, frozenset[str]]:
     return arm, frozenset(changed)
 
 
-def changed_in(arm: str, common: frozenset[str]) -> frozenset[str]:
-    """Of settings common to all arms, those that this one does not have anyway."""
+def line_of(arm: str, common: frozenset[str]) -> tuple[str, frozenset[str]]:
+    """The arm, and of the settings common to all arms those that it does not have anyway."""
     preset = "paper" if "preset paper" in common else default_settings().preset
-    return common - {f"{name} {value}" for name, value in plot.usual_settings(arm, preset).items()}
+    usual = plot.usual_settings(arm, preset)
+    return arm, common - {f"{name} {value}" for name, value in usual.items()}
 
 
-def line_of(name: str, common: frozenset[str]) -> tuple[str, frozenset[str]] | None:
-    """The arm, and all that its line changes, of an arm with a change of its own or none beside
-    those common to all; None if all have that change."""
-    arm, own = changes(name)
-    return (arm, own | changed_in(arm, common)) if own.isdisjoint(common) else None
-
-
-def choose(arms: dict, name: str, common: frozenset[str]) -> list[tuple[str, dict]]:
+def choose(arms: dict, arm: str, common: frozenset[str]) -> list[tuple[str, dict]]:
     """The runs of that line, each with its seed."""
-    line = line_of(name, common)
+    line = line_of(arm, common)
     fitting = (runs for label, runs in arms.items() if changes(label) == line)
     return [each for runs in fitting for each in runs.items()]
 
@@ -173,8 +166,7 @@ def report(runs: dict, reference: dict) -> str:
             said, rows = judge(groups, runs, common, reference)
             lines += [f"| **{claim}** | | | | | **{said}** |", *(f"| {row} |" for row in rows)]
         lines += [""]
-    names = {n for of in CLAIMS.values() for _, group in of for one in group for n in one.signs}
-    held = {line_of(name, c) for name in names - {BLIND} for c in configurations}
+    held = {line_of(arm, c) for arm in ARMS for c in configurations}
     ours = {label for of in runs.values() for label in of if changes(label)[0] in ARMS}
     alone = sorted(label for label in ours if changes(label) not in held)
     lines += [f"Left out, no other arm was run with these settings: {label}." for label in alone]

@@ -32,6 +32,7 @@ from results.made_with import record
 ROBOTS = ("Hopper", "Walker2D", "HalfCheetah", "Ant")  # of the paper's figure
 TINY = "--deter 16 --stoch 8 --units 16 --depth 2 --mdn-units 16 --horizon 5 --prefill 60 "
 TINY += "--batch-size 3 --length 8 --eval-every 100 --eval-episodes 2 --eval-max-steps 50"
+FREE = ("steps", "eval_episodes", "checkpoint_minutes")  # settings of which no figure depends
 OWN = ("--steps", "--env", "--arm", "--seed", "--run-dir", "--resume")  # that each run is given
 SMOKE = dict(seeds=[0], steps=200, out=Path("runs/smoke"), options=TINY.split())
 
@@ -96,7 +97,8 @@ def differing(folder: Path, options: list[str]) -> str:
         return ""
     wanted = dataclasses.asdict(train.parse(options).settings)
     now = dict.fromkeys(made) | wanted  # None: a setting of another version's
-    return ", ".join(sorted(train.fixed_changes(made, now)))
+    changed = sorted(n for n in now if now[n] != made.get(n) and n not in FREE)
+    return ", ".join(f"{name} {made.get(name)}" for name in changed)
 
 
 def steps_made(folder: Path, steps: int) -> int:

@@ -132,6 +132,9 @@ def test_a_run_of_other_settings_is_not_taken_for_the_one_asked_for(stand_in, ca
         reproduce.main([*arguments, "--", "--horizon", "7"])
     said = capsys.readouterr().err.splitlines()[-1]
     assert end.value.code == 2 and "a run with horizon 5: name another --out." in said
+    with pytest.raises(SystemExit):  # which a run may change as it goes on, but not a figure
+        reproduce.main([*arguments, "--", "--actor-lr", "1e-3", "--eval-every", "1000"])
+    assert "a run with actor_lr 0.0002, eval_every 5000: name" in capsys.readouterr().err
     older = asked.settings.to_json().replace('"ends_ahead"', '"heads_ahead"')
     (folder / "settings.json").write_text(older)
     with pytest.raises(SystemExit):
