@@ -33,6 +33,7 @@ def made_with() -> dict[str, object]:
         "torch": torch.__version__,
         "python": platform.python_version(),
         "processor": model[1] if model else platform.processor() or platform.machine(),
+        "instructions": torch.backends.cpu.get_cpu_capability(),  # AVX2, AVX512: digits differ
     }
 
 
