@@ -825,10 +825,12 @@ class Run:
             "goes on otherwise than it would have.")  # fmt: skip
 
 
-def fixed_changes(made: dict[str, object], now: dict[str, object]) -> list[str]:
+def fixed_changes(
+    made: dict[str, object], now: dict[str, object], free: tuple[str, ...] = CHANGEABLE
+) -> list[str]:
     """What may not change in a run but has: each such setting, and the value that it had."""
     changed = (name for name in now if now[name] != made.get(name))
-    return [f"{name} {made.get(name)}" for name in changed if name not in CHANGEABLE]
+    return [f"{name} {made.get(name)}" for name in changed if name not in free]
 
 
 def write_whole(path: Path, content: object, keep: Path | None = None) -> None:

@@ -68,7 +68,7 @@ CLAIMS = {  # each a list of (how many of them must hold, comparisons)
         (4, [above(robot, "maxent", "dreamer") for robot in ROBOTS]),
         (3, [Comparison(robot, MAJORITY, "above") for robot in ROBOTS]),
     ],
-    "What is collected covers more of the environment's states than without exploration": [
+    "What `maxent` collects covers more of the environment's states than what `revised` does": [
         (4, [above(robot, "maxent", "revised", covered) for robot in ROBOTS])
     ],
 }  # fmt: skip

@@ -14,11 +14,11 @@ import torch
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
-from train import write_whole
+import train
 
 
 def made_with() -> dict[str, object]:
-    """The code, the libraries and the processor of now; a commit ends in -dirty if files differ."""
+    """The code, torch, Python and the processor of now; a commit ends in -dirty if files differ."""
     git = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--exclude=*", "--abbrev=40"]
     # the repository that is ours, not one around it; and no lock that a commit would wait for
     here = os.environ | {"GIT_CEILING_DIRECTORIES": str(ROOT.parent), "GIT_OPTIONAL_LOCKS": "0"}
@@ -33,7 +33,7 @@ def made_with() -> dict[str, object]:
         "torch": torch.__version__,
         "python": platform.python_version(),
         "processor": model[1] if model else platform.processor() or platform.machine(),
-        "instructions": torch.backends.cpu.get_cpu_capability(),  # AVX2, AVX512: digits differ
+        "bfloat16": train.has_bfloat16(torch.device("cpu")),  # which `--precision auto` takes then
     }
 
 
@@ -47,5 +47,5 @@ def record(folder: Path, pid: int) -> bool:
         before = json.loads(path.read_text()) if path.exists() else []
         now = made_with() | {"threads": 1}  # reproduce.py gives each run one
         if now not in before:
-            write_whole(path, (json.dumps([*before, now], indent=2) + "\n").encode())
+            train.write_whole(path, (json.dumps([*before, now], indent=2) + "\n").encode())
     return True

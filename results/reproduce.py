@@ -32,7 +32,6 @@ from results.made_with import record
 ROBOTS = ("Hopper", "Walker2D", "HalfCheetah", "Ant")  # of the paper's figure
 TINY = "--deter 16 --stoch 8 --units 16 --depth 2 --mdn-units 16 --horizon 5 --prefill 60 "
 TINY += "--batch-size 3 --length 8 --eval-every 100 --eval-episodes 2 --eval-max-steps 50"
-FREE = ("steps", "eval_episodes", "checkpoint_minutes")  # settings of which no figure depends
 OWN = ("--steps", "--env", "--arm", "--seed", "--run-dir", "--resume")  # that each run is given
 SMOKE = dict(seeds=[0], steps=200, out=Path("runs/smoke"), options=TINY.split())
 
@@ -91,14 +90,15 @@ def runs(command: argparse.Namespace, options: list[str]) -> dict[Path, list[str
 def differing(folder: Path, options: list[str]) -> str:
     """In which settings the run that a folder holds is not of these options, of whichever version
     it is: none, if there is none."""
+    wanted = dataclasses.asdict(train.parse(options).settings)
     try:
         made = dict(json.loads((folder / "settings.json").read_text()))
-    except (OSError, ValueError, TypeError):  # damaged, and train.py will say so
+        goes_on = ["steps"] if made["steps"] < wanted["steps"] else []
+    except (OSError, ValueError, TypeError, KeyError):  # damaged, and train.py will say so
         return ""
-    wanted = dataclasses.asdict(train.parse(options).settings)
     now = dict.fromkeys(made) | wanted  # None: a setting of another version's
-    changed = sorted(n for n in now if now[n] != made.get(n) and n not in FREE)
-    return ", ".join(f"{name} {made.get(name)}" for name in changed)
+    free = ("eval_episodes", "checkpoint_minutes", *goes_on)  # the rest makes another figure
+    return ", ".join(sorted(train.fixed_changes(made, now, free)))
 
 
 def steps_made(folder: Path, steps: int) -> int:

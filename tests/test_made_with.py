@@ -24,7 +24,7 @@ def test_it_names_commit_torch_python_and_processor(monkeypatch, tmp_path):
     found = made_with.made_with()
     assert found["torch"] == torch.__version__
     assert found["python"] == sys.version.split()[0] and found["processor"]
-    assert found["instructions"] == torch.backends.cpu.get_cpu_capability()
+    assert found["bfloat16"] == made_with.train.has_bfloat16(torch.device("cpu"))
     assert found["commit"] == "unknown" or len(found["commit"].removesuffix("-dirty")) == 40
     monkeypatch.setattr(made_with, "ROOT", tmp_path)  # no repository
     assert made_with.made_with()["commit"] == "unknown"

@@ -123,7 +123,8 @@ def test_bad_input_ends_with_one_sentence_before_anything_is_made(
 def test_a_run_of_other_settings_is_not_taken_for_the_one_asked_for(stand_in, capsys):
     folder = stand_in / f"{HOPPER}-maxent-seed0"
     write_run(folder, 3000, "weights.pt")
-    asked = reproduce.train.parse([f"--env={HOPPER}", "--steps=3000", "--eval-episodes=4"])
+    asked = reproduce.train.parse([f"--env={HOPPER}", "--steps=3000", "--eval-episodes=4",
+                                     "--checkpoint-minutes=1"])  # fmt: skip
     (folder / "settings.json").write_text(asked.settings.to_json())
     arguments = ["--arms", "maxent", "--envs", HOPPER, "--seeds", "0", "--steps", "3000"]
     arguments += ["--out", str(stand_in)]
@@ -135,6 +136,9 @@ def test_a_run_of_other_settings_is_not_taken_for_the_one_asked_for(stand_in, ca
     with pytest.raises(SystemExit):  # which a run may change as it goes on, but not a figure
         reproduce.main([*arguments, "--", "--actor-lr", "1e-3", "--eval-every", "1000"])
     assert "a run with actor_lr 0.0002, eval_every 5000: name" in capsys.readouterr().err
+    with pytest.raises(SystemExit):  # a longer one, cut off, has another schedule of β
+        reproduce.main([*arguments[:-4], "--steps", "2500", *arguments[-2:]])
+    assert "a run with steps 3000: name" in capsys.readouterr().err
     older = asked.settings.to_json().replace('"ends_ahead"', '"heads_ahead"')
     (folder / "settings.json").write_text(older)
     with pytest.raises(SystemExit):
