@@ -828,7 +828,7 @@ class Run:
 def fixed_changes(
     made: dict[str, object], now: dict[str, object], free: tuple[str, ...] = CHANGEABLE
 ) -> list[str]:
-    """What may not change in a run but has: each such setting, and the value that it had."""
+    """What is not free to change in a run but has: each such setting, and the value it had."""
     changed = (name for name in now if now[name] != made.get(name))
     return [f"{name} {made.get(name)}" for name in changed if name not in free]
 

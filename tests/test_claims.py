@@ -208,6 +208,7 @@ def test_claims_say_how_many_of_their_comparisons_must_hold():
 def test_the_claim_of_coverage_looks_at_coverage():
     runs = made_up(maxent=[7.0, 8, 9], revised=[1.0, 2, 3])
     assert judged(runs)[5] == SUPPORTED
+    assert "Left out" not in claims.report(runs, plot.read_reference())
     for run in (run for arms in runs.values() for of in arms.values() for run in of.values()):
         run["coverage"] = -run["eval_return"]
     assert judged(runs)[5] == REFUTED
